@@ -1,0 +1,3 @@
+"""xalign: keyframe in, correction out."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,1 @@
+"""The command line and the live node: they wire io to core."""

@@ -1,0 +1,112 @@
+"""Which of the waiting anchors agree with the odometry between them under one similarity, scale included."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from xalign_ros.core.config import Config
+from xalign_ros.core.lie import Array, project_rotation, se3_log
+from xalign_ros.core.records import Anchor
+from xalign_ros.core.transforms import SE3, Sim3
+
+SCALE_BASELINE_SIGMAS = 3.0  # of two anchors, below which their distance says nothing about scale
+SCALE_RANGE = (1e-3, 1e3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Witness:
+    """An anchor, where the odometry says its keyframe was, and the odometry's path length there (odometry units)."""
+
+    anchor: Anchor
+    T_odom_cam: SE3
+    path: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Consensus:
+    """S_map_odom of a hypothesis and the indices of the witnesses that agree with it."""
+
+    S_map_odom: Sim3
+    members: tuple[int, ...]
+
+
+def find_consensus(witnesses: Sequence[Witness], metric: bool, config: Config) -> Consensus | None:
+    """The largest set that agrees with the newest witness, or None below lock.anchors.
+
+    Every pair with the newest is a hypothesis: rotation from the anchors' orientations, scale from the two distances
+    (one if metric), translation through both. A witness agrees when its residual is inside the chi-square gate of its
+    own covariance, the hypothesis' and what the odometry may have drifted between them.
+    """
+    if len(witnesses) < config.lock.anchors:
+        return None
+    newest = len(witnesses) - 1
+    best: tuple[int, float, Sim3, tuple[int, ...]] | None = None
+    for other in range(newest):
+        hypothesis = _similarity(witnesses[other], witnesses[newest], metric)
+        if hypothesis is None:
+            continue
+        S, scale_sigma = hypothesis
+        chi2 = np.array([_chi2(S, scale_sigma, w, witnesses[newest], config) for w in witnesses])
+        members = tuple(int(n) for n in np.flatnonzero(chi2 < config.lock.chi2))
+        score = (len(members), -float(chi2[list(members)].sum()))
+        if newest in members and (best is None or score > best[:2]):
+            best = (*score, S, members)
+    if best is None or best[0] < config.lock.anchors:
+        return None
+    S = _fit(best[2], [witnesses[n] for n in best[3]], metric)
+    return Consensus(S, best[3])
+
+
+def _similarity(a: Witness, b: Witness, metric: bool) -> tuple[Sim3, float] | None:
+    """S_map_odom through two witnesses and the sigma of its log-scale; None where two anchors cannot tell the scale."""
+    R = project_rotation(a.anchor.T_map_cam.R @ a.T_odom_cam.R.T + b.anchor.T_map_cam.R @ b.T_odom_cam.R.T)
+    d_map = b.anchor.T_map_cam.t - a.anchor.T_map_cam.t
+    d_odom = b.T_odom_cam.t - a.T_odom_cam.t
+    sigma = float(np.sqrt(np.trace(a.anchor.cov_cam[3:, 3:]) + np.trace(b.anchor.cov_cam[3:, 3:])))
+    length_map, length_odom = float(np.linalg.norm(d_map)), float(np.linalg.norm(d_odom))
+    scale, scale_sigma = 1.0, 0.0
+    if not metric:
+        if length_map < SCALE_BASELINE_SIGMAS * sigma or length_odom <= 0:
+            return None
+        scale, scale_sigma = length_map / length_odom, sigma / length_map
+        if not SCALE_RANGE[0] < scale < SCALE_RANGE[1]:
+            return None
+    middle_map = (a.anchor.T_map_cam.t + b.anchor.T_map_cam.t) / 2
+    middle_odom = (a.T_odom_cam.t + b.T_odom_cam.t) / 2
+    return Sim3(R, middle_map - scale * R @ middle_odom, scale), scale_sigma
+
+
+def _chi2(S: Sim3, scale_sigma: float, w: Witness, origin: Witness, config: Config) -> float:
+    """Squared Mahalanobis length of the witness' 6 residuals under S."""
+    predicted = (S @ w.T_odom_cam).rigid_pose()
+    T = w.anchor.T_map_cam.inverse() @ predicted
+    r = se3_log(T.R, T.t)
+    o = config.odometry
+    path = S.s * abs(w.path - origin.path)
+    apart = S.s * float(np.linalg.norm(w.T_odom_cam.t - origin.T_odom_cam.t))
+    turn = o.rotation_floor_rad**2 + o.rotation_rad_per_sqrt_m**2 * path
+    drift = (o.translation_ratio * path) ** 2 + o.translation_floor_m**2
+    swing = apart**2 * (turn + scale_sigma**2 + o.scale_per_sqrt_m**2 * path / 3)
+    cov = w.anchor.cov_cam + origin.anchor.cov_cam
+    cov = cov + np.diag(np.r_[np.full(3, turn), np.full(3, drift + swing)])
+    return float(r @ np.linalg.solve(cov, r))
+
+
+def _fit(S: Sim3, witnesses: Sequence[Witness], metric: bool) -> Sim3:
+    """Least squares over the members: mean rotation, then scale and translation of the positions (Umeyama 1991)."""
+    weight = np.array([1 / np.trace(w.anchor.cov_cam[3:, 3:]) for w in witnesses])
+    weight /= weight.sum()
+    R = project_rotation(
+        sum((k * w.anchor.T_map_cam.R @ w.T_odom_cam.R.T for k, w in zip(weight, witnesses, strict=True)), np.zeros((3, 3)))
+    )
+    x: Array = np.array([w.T_odom_cam.t for w in witnesses])
+    y: Array = np.array([w.anchor.T_map_cam.t for w in witnesses])
+    mx, my = weight @ x, weight @ y
+    dx, dy = (x - mx) @ R.T, y - my
+    spread = float((weight * (dx * dx).sum(axis=1)).sum())
+    scale = 1.0 if metric or spread <= 0 else float((weight * (dx * dy).sum(axis=1)).sum()) / spread
+    scale = scale if scale > 0 else S.s
+    return Sim3(R, my - scale * R @ mx, scale)

@@ -1,0 +1,57 @@
+"""What a keyframe must be before it may touch the estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from xalign_ros.core.records import FEATURE_REASONS, Keyframe, Rejection
+from xalign_ros.core.reference_map import ReferenceMap
+
+BORDER_PX = 1.0  # a detector's sub-pixel refinement may step over the edge
+ROTATION_TOLERANCE = 1e-6
+
+
+def refusal(keyframe: Keyframe, earlier: Sequence[Keyframe], map_: ReferenceMap) -> Rejection | None:
+    """Why a keyframe (or, for FEATURE_REASONS, its features) cannot be used; None if it can.
+
+    `earlier` are the last keyframes of the same session that were taken, oldest first.
+    """
+    reason, detail = _fault(keyframe, earlier, map_)
+    if not reason:
+        return None
+    return Rejection(keyframe.id, keyframe.session, keyframe.stamp_ns, reason, detail)
+
+
+def _fault(k: Keyframe, earlier: Sequence[Keyframe], map_: ReferenceMap) -> tuple[str, str]:
+    T, f = k.T_odom_cam, k.features
+    if not (np.isfinite(T.R).all() and np.isfinite(T.t).all()):
+        return "bad_pose", "the odometry pose is not finite"
+    if np.abs(T.R @ T.R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(T.R) < 0:
+        return "bad_pose", "the odometry pose is not a rotation and a translation"
+    if any(k.id == e.id for e in earlier):
+        return "duplicate_id", f"keyframe {k.id} of session {k.session} was received before"
+    if earlier and k.stamp_ns <= earlier[-1].stamp_ns:
+        return "stamp_backwards", f"its stamp is {(earlier[-1].stamp_ns - k.stamp_ns) / 1e9:.3f} s behind the last one's"
+    if earlier and k.id < earlier[-1].id:
+        return "duplicate_id", f"id {k.id} follows id {earlier[-1].id}; within a session ids must rise"
+    if k.camera is None:
+        return "no_intrinsics", "its camera has no intrinsics"
+    if not len(f):
+        return "no_features", "it carries no features"
+    if not np.isfinite(f.uv).all() or not k.camera.inside(f.uv, BORDER_PX).all():
+        worst = f.uv[~(np.isfinite(f.uv).all(axis=1) & k.camera.inside(f.uv, BORDER_PX))][0]
+        return "bad_pixel", f"feature at {worst.tolist()} px is outside its {k.camera.width} x {k.camera.height} image"
+    width = map_.descriptors.shape[1]
+    if (f.name, f.norm, f.descriptors.shape[1]) != (map_.descriptor_name, map_.norm, width):
+        have = f"'{f.name}' {f.norm.name} of {f.descriptors.shape[1]}"
+        return "bad_descriptor", f"its descriptors are {have}, the map's '{map_.descriptor_name}' {map_.norm.name} of {width}"
+    if f.norm.dtype is np.float32 and not np.isfinite(f.descriptors).all():
+        return "bad_descriptor", "a descriptor is not finite"
+    return "", ""
+
+
+def carries_pose(rejection: Rejection) -> bool:
+    """Whether the keyframe's odometry pose is used all the same."""
+    return rejection.reason in FEATURE_REASONS

@@ -1,0 +1,152 @@
+"""Batched SO(3), SE(3) and Sim(3) on arrays.
+
+A similarity acts as x_a = s R x_b + t. Tangents are ordered rotation (rad), translation, log-scale and perturb on the
+right, S Exp(d), so they live in the axes and units of the second frame. Sources: Sola, Deray, Atchuthan, "A micro Lie
+theory" (arXiv 1812.01537) for SO(3) and SE(3); Eade, "Lie groups for 2D and 3D transformations" (2013) for Sim(3).
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+EYE3 = np.eye(3)
+
+
+def hat(w: ArrayLike) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    w = np.asarray(w, float)
+    W = np.zeros((*w.shape, 3))
+    W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
+    W[..., 1, 0], W[..., 2, 0], W[..., 2, 1] = w[..., 2], -w[..., 1], w[..., 0]
+    return W
+
+
+def quat_from_rotation(R: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) x y z w with w >= 0 of rotations (..., 3, 3); Shepperd's branch of largest pivot."""
+    R = np.asarray(R, float)
+    m = R.reshape(-1, 9)
+    trace = m[:, 0] + m[:, 4] + m[:, 8]
+    pivots = np.stack([m[:, 0], m[:, 4], m[:, 8], trace], axis=1)
+    branch = pivots.argmax(axis=1)
+    q = np.empty((len(m), 4))
+    M = m.reshape(-1, 3, 3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        r = branch == i
+        q[r, i] = 1 + 2 * M[r, i, i] - trace[r]
+        q[r, j] = M[r, j, i] + M[r, i, j]
+        q[r, k] = M[r, k, i] + M[r, i, k]
+        q[r, 3] = M[r, k, j] - M[r, j, k]
+    r = branch == 3
+    q[r] = np.stack([M[r, 2, 1] - M[r, 1, 2], M[r, 0, 2] - M[r, 2, 0], M[r, 1, 0] - M[r, 0, 1], 1 + trace[r]], axis=1)
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    q[q[:, 3] < 0] *= -1
+    return q.reshape(*R.shape[:-2], 4)
+
+
+def rotation_from_quat(q_xyzw: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) of quaternions (..., 4) x y z w, normalised here; a zero quaternion gives NaN."""
+    q = np.asarray(q_xyzw, float)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def so3_exp(w: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3) in rad (Rodrigues)."""
+    w = np.asarray(w, float)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    W = hat(w)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    R: Array = EYE3 + a * W + b * (W @ W)
+    return R
+
+
+def so3_log(R: ArrayLike) -> Array:
+    """Rotation vectors (..., 3) in rad, angle in [0, pi], of rotations (..., 3, 3); through the quaternion, exact at pi."""
+    q = quat_from_rotation(R)
+    v, w = q[..., :3], q[..., 3:]
+    n = np.linalg.norm(v, axis=-1, keepdims=True)
+    small = n < 1e-12
+    with np.errstate(invalid="ignore", divide="ignore"):
+        k = np.where(small, 2.0, 2 * np.arctan2(n, w) / np.where(small, 1.0, n))
+    return np.asarray(k * v)
+
+
+def project_rotation(M: ArrayLike) -> Array:
+    """Nearest rotations (..., 3, 3) to matrices (..., 3, 3) in the Frobenius norm (orthogonal Procrustes)."""
+    U, _, Vt = np.linalg.svd(np.asarray(M, float))
+    d = np.ones((*U.shape[:-2], 3))
+    d[..., 2] = np.linalg.det(U @ Vt)
+    return np.asarray((U * d[..., None, :]) @ Vt)
+
+
+def sim3_V(w: ArrayLike, log_scale: ArrayLike) -> Array:
+    """V (..., 3, 3) = integral over tau in [0, 1] of e^(tau sigma) Exp(tau w): the translation of Exp is V u.
+
+    With z = sigma + i |w| and E = (e^z - 1) / z the three coefficients are real and imaginary parts of E.
+    """
+    w = np.asarray(w, float)
+    sigma = np.asarray(log_scale, float)
+    angle = np.linalg.norm(w, axis=-1)
+    z = sigma + 1j * angle
+
+    def expm1_over(x: Any) -> Any:
+        zero = np.abs(x) < 1e-300
+        return np.where(zero, 1.0, np.expm1(x) / np.where(zero, 1.0, x))
+
+    E, A = expm1_over(z), expm1_over(sigma)
+    safe = np.where(angle < 1e-100, 1.0, angle)
+    B = np.asarray(E.imag / safe)[..., None, None]
+    # Rounding in A - Re E is divided by |w|^2 here and multiplied by |W^2| below: harmless at any angle.
+    C = np.asarray((A - E.real) / safe**2)[..., None, None]
+    W = hat(w)
+    V: Array = np.asarray(A)[..., None, None] * EYE3 + B * W + C * (W @ W)
+    return V
+
+
+def sim3_exp(tangent: ArrayLike) -> tuple[Array, Array, Array]:
+    """R (..., 3, 3), t (..., 3), s (...) of tangents (..., 7)."""
+    x = np.asarray(tangent, float)
+    V = sim3_V(x[..., :3], x[..., 6])
+    return so3_exp(x[..., :3]), np.einsum("...ij,...j->...i", V, x[..., 3:6]), np.exp(x[..., 6])
+
+
+def sim3_log(R: ArrayLike, t: ArrayLike, s: ArrayLike) -> Array:
+    """Tangents (..., 7) of similarities R (..., 3, 3), t (..., 3), s (...)."""
+    w, sigma = so3_log(R), np.log(np.asarray(s, float))
+    u = np.linalg.solve(sim3_V(w, sigma), np.asarray(t, float)[..., None])[..., 0]
+    return np.concatenate([w, u, sigma[..., None]], axis=-1)
+
+
+def se3_exp(tangent: ArrayLike) -> tuple[Array, Array]:
+    """R (..., 3, 3), t (..., 3) of tangents (..., 6)."""
+    x = np.asarray(tangent, float)
+    V = sim3_V(x[..., :3], np.zeros(x.shape[:-1]))
+    return so3_exp(x[..., :3]), np.einsum("...ij,...j->...i", V, x[..., 3:6])
+
+
+def se3_log(R: ArrayLike, t: ArrayLike) -> Array:
+    """Tangents (..., 6) of rigid transforms R (..., 3, 3), t (..., 3)."""
+    return sim3_log(R, t, np.ones(np.shape(t)[:-1]))[..., :6]
+
+
+def sim3_adjoint(R: ArrayLike, t: ArrayLike, s: ArrayLike) -> Array:
+    """Ad (..., 7, 7) with S Exp(d) S^-1 = Exp(Ad d); with s = 1 its first six rows and columns are SE(3)'s."""
+    R, t = np.asarray(R, float), np.asarray(t, float)
+    Ad = np.zeros((*t.shape[:-1], 7, 7))
+    Ad[..., :3, :3] = R
+    Ad[..., 3:6, :3] = hat(t) @ R
+    Ad[..., 3:6, 3:6] = np.asarray(s, float)[..., None, None] * R
+    Ad[..., 3:6, 6] = -t
+    Ad[..., 6, 6] = 1
+    return Ad

@@ -1,0 +1,234 @@
+"""From posed keyframes to a ReferenceMap: tracks, triangulation, one descriptor per point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from xalign_ros.core.camera import Camera
+from xalign_ros.core.config import Pnp
+from xalign_ros.core.descriptors import nearest_to_mean, pair_distance
+from xalign_ros.core.lie import Array
+from xalign_ros.core.map_refinement import Bearings, refine_poses
+from xalign_ros.core.pnp import Points2D3D, Pose, refine_pose
+from xalign_ros.core.records import NO_TRACK, Keyframe, Norm
+from xalign_ros.core.reference_map import ReferenceMap
+from xalign_ros.core.tracks import matched_tracks, seen_twice
+from xalign_ros.core.transforms import SE3
+from xalign_ros.core.triangulation import Triangulated, triangulate
+
+FOLDS = 5
+KEYPOINT_SIGMA_PX = 0.5  # of a good detector; what residuals have above it the poses brought in
+START_SIGMA_PX = 2.0  # before the map's own reprojection scale is known
+
+
+class _Observations:
+    """All features of all posed keyframes as arrays: frame (F,), uv (F, 2), ray (F, 3) in the map, centre (F, 3)."""
+
+    def __init__(self, keyframes: Sequence[Keyframe], poses: Sequence[SE3]) -> None:
+        sizes = [len(k.features) for k in keyframes]
+        self.offset = np.r_[0, np.cumsum(sizes)].astype(np.int64)
+        self.frame = np.repeat(np.arange(len(keyframes)), sizes)
+        self.uv = np.concatenate([k.features.uv for k in keyframes])
+        self.descriptors = np.concatenate([k.features.descriptors for k in keyframes])
+        self.ray_cam = np.concatenate([_camera(k).unproject(k.features.uv)[0] for k in keyframes])
+        self.valid = np.isfinite(self.ray_cam).all(axis=1)
+        self.focal = np.array([_camera(k).K[:2].mean() for k in keyframes])[self.frame]
+        self.move(poses)
+
+    def move(self, poses: Sequence[SE3]) -> None:
+        self.poses = list(poses)
+        self.ray = np.einsum("fij,fj->fi", np.array([T.R for T in poses])[self.frame], self.ray_cam)
+        self.centre = np.array([T.t for T in poses])[self.frame]
+
+
+def _camera(keyframe: Keyframe) -> Camera:
+    if keyframe.camera is None:
+        raise ValueError(f"keyframe {keyframe.id} has no camera")
+    return keyframe.camera
+
+
+def build_map(
+    keyframes: Sequence[Keyframe], poses: Sequence[SE3], *, map_id: str, source: str, frame: str = "map", metric: bool
+) -> ReferenceMap:
+    """The map of posed keyframes (poses are T_map_cam), by track id where every feature set has ids, else by matching.
+
+    Raises ValueError when the keyframes do not share one descriptor or no point can be triangulated.
+    """
+    kinds = {(k.features.name, k.features.norm, k.features.descriptors.shape[1]) for k in keyframes if len(k.features)}
+    if len(kinds) != 1:
+        raise ValueError(f"{len(keyframes)} keyframes carry {len(kinds)} kinds of descriptors; a map needs exactly one")
+    name, norm, _ = kinds.pop()
+    keyframes, poses = zip(*[(k, T) for k, T in zip(keyframes, poses, strict=True) if len(k.features)], strict=True)
+    obs = _Observations(keyframes, poses)
+    track = _track_ids(keyframes, obs) if _have_tracks(keyframes) else matched_tracks(keyframes, poses)
+    cameras, which = _distinct_cameras([_camera(k) for k in keyframes])
+    return assemble_map(
+        obs=obs,
+        track=track,
+        cameras=cameras,
+        keyframe_camera=which,
+        refine=True,
+        map_id=map_id,
+        source=source,
+        frame=frame,
+        metric=metric,
+        name=name,
+        norm=norm,
+    )
+
+
+def assemble_map(
+    *,
+    obs: _Observations,
+    track: np.ndarray,
+    cameras: tuple[Camera, ...],
+    keyframe_camera: np.ndarray,
+    refine: bool,
+    map_id: str,
+    source: str,
+    frame: str,
+    metric: bool,
+    name: str,
+    norm: Norm,
+) -> ReferenceMap:
+    """Triangulate tracks (F,), -1 = none, and keep what is well determined."""
+    used = np.flatnonzero((track >= 0) & obs.valid)
+    track_index, compact = np.unique(track[used], return_inverse=True)
+    given = obs.poses
+    points, sigma_px = _triangulate_twice(obs, used, compact, len(track_index))
+    jitter_px = np.sqrt(max(sigma_px**2 - KEYPOINT_SIGMA_PX**2, 0.0))
+    if refine and points.kept.any() and jitter_px > 0:
+        bearings = _bearings(obs, used, compact, points, sigma_px)
+        obs.move(refine_poses(obs.poses, points.xyz, bearings, jitter_px / float(np.median(obs.focal))))
+        points, sigma_px = _triangulate_twice(obs, used, compact, len(track_index))
+    if not points.kept.any():
+        raise ValueError(f"none of {len(track_index)} tracks of {len(obs.poses)} keyframes can be triangulated")
+    new_index = np.full(len(track_index), -1)
+    new_index[points.kept] = np.arange(points.kept.sum())
+    feature_point = np.full(len(obs.uv), -1, np.int32)
+    feature_point[used] = np.where(points.inlier, new_index[compact], -1)
+    seen = np.flatnonzero(feature_point >= 0)
+    medoid = nearest_to_mean(obs.descriptors[seen], feature_point[seen], int(points.kept.sum()), norm)
+    descriptors = obs.descriptors[seen[medoid]]
+    return ReferenceMap(
+        map_id=map_id,
+        version="",
+        frame=frame,
+        metric=metric,
+        source=source,
+        descriptor_name=name,
+        norm=norm,
+        cameras=cameras,
+        points=points.xyz[points.kept],
+        point_cov=points.cov[points.kept].astype(np.float32),
+        descriptors=descriptors,
+        keyframe_R=np.array([T.R for T in obs.poses]),
+        keyframe_t=np.array([T.t for T in obs.poses]),
+        keyframe_camera=keyframe_camera,
+        feature_offset=obs.offset,
+        feature_uv=obs.uv.astype(np.float32),
+        feature_descriptors=obs.descriptors,
+        feature_point=feature_point,
+        sigma_px=sigma_px,
+        descriptor_gate=_descriptor_gate(obs.descriptors[seen], descriptors[feature_point[seen]], norm),
+        anchor_sigma=_anchor_sigma(obs, feature_point, given, cameras, keyframe_camera, sigma_px),
+    )
+
+
+def _triangulate_twice(obs: _Observations, used: np.ndarray, track: np.ndarray, count: int) -> tuple[Triangulated, float]:
+    """The second pass takes the reprojection scale that the first one found, so poor poses do not empty the map."""
+    sigma_px = START_SIGMA_PX
+    for _ in range(2):
+        sigma_rad = sigma_px / obs.focal[used]
+        points = triangulate(track, count, obs.centre[used], obs.ray[used], sigma_rad)
+        # A residual of two degrees of freedom: the median of its length is 1.1774 sigma (Rayleigh).
+        length = points.residual[points.inlier] * sigma_px
+        degrees = max(1 - 1.5 * points.kept.sum() / max(len(length), 1), 0.25)  # 3 of 2n numbers go into the point
+        sigma_px = float(np.clip(np.median(length) / 1.1774 / np.sqrt(degrees), KEYPOINT_SIGMA_PX, 4.0)) if len(length) else sigma_px
+    return points, sigma_px
+
+
+def _bearings(obs: _Observations, used: np.ndarray, track: np.ndarray, points: Triangulated, sigma_px: float) -> Bearings:
+    rows = used[points.inlier]
+    return Bearings(obs.frame[rows], track[points.inlier], obs.ray_cam[rows], sigma_px / obs.focal[rows])
+
+
+def _anchor_sigma(
+    obs: _Observations,
+    track: np.ndarray,
+    given: Sequence[SE3],
+    cameras: tuple[Camera, ...],
+    keyframe_camera: np.ndarray,
+    sigma_px: float,
+) -> tuple[float, float]:
+    """What anchors in this map err beyond their own covariance: (rad, m).
+
+    Every fifth keyframe is held out in turn, the rest is triangulated anew, and the held-out keyframe's pose from its
+    own tracks is compared with the pose it was given. Per axis, robust: 1.4826 medians (Rousseeuw and Croux 1993).
+    """
+    count = int(track.max()) + 1
+    error, own = [], []
+    for fold in range(FOLDS):
+        held = obs.frame % FOLDS == fold
+        rows = np.flatnonzero((track >= 0) & ~held)
+        rest = triangulate(track[rows], count, obs.centre[rows], obs.ray[rows], sigma_px / obs.focal[rows])
+        for k in range(fold, len(given), FOLDS):
+            features = slice(obs.offset[k], obs.offset[k + 1])
+            seen = np.flatnonzero(track[features] >= 0)
+            seen = seen[rest.kept[track[features][seen]]]
+            point = track[features][seen]
+            pairs = Points2D3D(obs.uv[features][seen], np.full(len(seen), sigma_px), rest.xyz[point], rest.cov[point])
+            pose = refine_pose(obs.poses[k], pairs, cameras[keyframe_camera[k]], Pnp()) if len(seen) >= 12 else ""
+            if isinstance(pose, Pose):
+                error.append((given[k].inverse() @ pose.T_map_cam).log())
+                own.append(np.diag(pose.cov_cam))
+    if len(error) < FOLDS:
+        return 0.0, 0.0
+    spread = (1.4826 * np.median(np.abs(error), axis=0)) ** 2
+    excess = np.maximum(spread - np.median(own, axis=0), 0)
+    return float(np.sqrt(excess[:3].mean())), float(np.sqrt(excess[3:].mean()))
+
+
+def _descriptor_gate(observed: np.ndarray, of_point: np.ndarray, norm: Norm) -> float:
+    """Distance that separates descriptors of one point from descriptors of two.
+
+    Half way (in standard deviations of both) between the distances within points, medoids themselves left out, and those
+    between random pairs.
+    """
+    within = pair_distance(observed, of_point, norm)
+    within = within[within > 0]
+    between = pair_distance(observed, np.roll(of_point, len(of_point) // 2 + 1, axis=0), norm)
+    if not len(within):
+        return float(between.mean())
+    a, b = float(within.std()), float(between.std())
+    return float((within.mean() * b + between.mean() * a) / (a + b)) if a + b > 0 else float(within.mean())
+
+
+def _have_tracks(keyframes: Sequence[Keyframe]) -> bool:
+    return all(k.features.track_ids is not None for k in keyframes)
+
+
+def _track_ids(keyframes: Sequence[Keyframe], obs: _Observations) -> np.ndarray:
+    """Track of every feature (F,), -1 = none; ids of different sessions are different tracks."""
+    ids = np.concatenate([k.features.track_ids for k in keyframes if k.features.track_ids is not None])
+    session = np.repeat([k.session for k in keyframes], np.diff(obs.offset))
+    key = np.stack([session.astype(np.uint64), ids], axis=1)
+    _, track = np.unique(key, axis=0, return_inverse=True)
+    track = np.where(ids == NO_TRACK, -1, track)
+    track[seen_twice(track, obs.frame)] = -1
+    return track
+
+
+def _distinct_cameras(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], np.ndarray]:
+    found: dict[tuple[object, ...], int] = {}
+    distinct: list[Camera] = []
+    which = np.zeros(len(cameras), np.int32)
+    for n, c in enumerate(cameras):
+        key = (c.model, *c.K.tolist(), *c.D.tolist(), c.width, c.height)
+        if key not in found:
+            found[key] = len(distinct)
+            distinct.append(c)
+        which[n] = found[key]
+    return tuple(distinct), which

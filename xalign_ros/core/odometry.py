@@ -1,0 +1,51 @@
+"""The noise model of odometry edges and what it does to a prediction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xalign_ros.core.config import Odometry
+from xalign_ros.core.lie import Array
+from xalign_ros.core.records import Keyframe, RelativePose, Solution
+from xalign_ros.core.transforms import SE3, Sim3
+
+METRIC_WALK = 0.1  # part of metric_scale_sigma that a metric odometry's scale may wander per sqrt(m)
+
+
+def edge_between(i: Keyframe, j: Keyframe, scale: float, config: Odometry) -> RelativePose:
+    """The odometry edge between two keyframes; `scale` in metres per odometry unit turns the model's metres around.
+
+    A random walk over the distance (rotation, log-scale), a part of the distance (translation), and floors; raised to
+    the growth of the source's own marginal covariance where it gives one.
+    """
+    T_i_j = i.T_odom_cam.inverse() @ j.T_odom_cam
+    distance = float(np.linalg.norm(T_i_j.t))
+    metres = scale * distance
+    rotation = config.rotation_floor_rad**2 + config.rotation_rad_per_sqrt_m**2 * metres
+    translation = (config.translation_floor_m / scale) ** 2 + (config.translation_ratio * distance) ** 2
+    walk = METRIC_WALK * config.metric_scale_sigma if j.metric_scale else config.scale_per_sqrt_m
+    variance = np.r_[np.full(3, rotation), np.full(3, translation), walk**2 * max(metres, 1e-4)]
+    if i.cov_cam is not None and j.cov_cam is not None:
+        variance[:6] = np.maximum(variance[:6], np.diag(j.cov_cam) - np.diag(i.cov_cam))
+    return RelativePose(i.id, j.id, T_i_j, np.sqrt(variance))
+
+
+def predict(solution: Solution, edge: RelativePose) -> tuple[Sim3, Array]:
+    """S_map_j and its covariance (7, 7) from the newest node of a solution and an edge: S_i Z, Ad(Z^-1) C Ad^T + Q."""
+    S = solution.S_map_i[-1] @ edge.T_i_j
+    Ad = edge.T_i_j.inverse().as_sim3().adjoint()
+    cov = Ad @ solution.cov @ Ad.T + np.diag(edge.sigmas**2)
+    return S, (cov + cov.T) / 2
+
+
+def pose_covariance(S: Sim3, cov: Array) -> Array:
+    """Covariance (6, 6) of T_map_cam, camera axes, rad and m, of a node S_map_i with covariance (7, 7)."""
+    D = np.r_[1.0, 1.0, 1.0, S.s, S.s, S.s]
+    return np.asarray(D[:, None] * cov[:6, :6] * D)
+
+
+def odom_in_map(S_map_i: Sim3, cov: Array, T_odom_i: SE3) -> tuple[Sim3, Array]:
+    """S_map_odom = S_map_i T_i_odom with its covariance (7, 7) = Ad(T_odom_i) C Ad^T, in odometry axes and units."""
+    Ad = T_odom_i.as_sim3().adjoint()
+    C = Ad @ cov @ Ad.T
+    return S_map_i @ T_odom_i.inverse(), (C + C.T) / 2

@@ -1,0 +1,134 @@
+"""Absolute pose from 2D-3D matches: seeded LO-RANSAC on bearings, refinement in true pixels, calibrated covariance.
+
+RANSAC is PoseLib's (Larsson), fed with a virtual pinhole: rays come from our own camera model, so that any model works
+and an unknown one cannot turn into an identity pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+
+from xalign_ros.core.camera import Camera
+from xalign_ros.core.config import Pnp
+from xalign_ros.core.lie import Array, hat
+from xalign_ros.core.transforms import SE3
+
+MAX_RAY_RAD = np.deg2rad(80.0)  # of a virtual pinhole
+SWEEPS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """T_map_cam with cov_cam (6, 6), camera axes; inlier (N,) of the matches, rms_px over them, rms in sigmas."""
+
+    T_map_cam: SE3
+    cov_cam: Array
+    inlier: np.ndarray
+    rms_px: float
+    rms_sigmas: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points2D3D:
+    """N matches: uv (N, 2) px with sigma_px (N,), xyz (N, 3) m in the map with covariance (N, 3, 3)."""
+
+    uv: Array
+    sigma_px: Array
+    xyz: Array
+    cov: Array
+
+
+def estimate_pose(m: Points2D3D, camera: Camera, seed: int, config: Pnp) -> Pose | str:
+    """The pose that most matches agree on, or the reason why there is none (a rejection reason)."""
+    if len(m.uv) < config.min_inliers:
+        return "too_few_matches"
+    rays, valid = camera.unproject(m.uv)
+    usable = np.flatnonzero(valid & (rays[:, 2] > np.cos(MAX_RAY_RAD)))
+    if len(usable) < config.min_inliers:
+        return "too_few_matches"
+    focal = float(camera.K[:2].mean())
+    size = int(2 * focal * np.tan(MAX_RAY_RAD)) + 1
+    flat = focal * rays[usable, :2] / rays[usable, 2:]
+    pose, info = poselib.estimate_absolute_pose(
+        flat,
+        m.xyz[usable],
+        {"model": "PINHOLE", "width": size, "height": size, "params": [focal, focal, 0.0, 0.0]},
+        {
+            "max_reproj_error": config.threshold_sigmas * float(np.median(m.sigma_px)),
+            "seed": seed,
+            "max_iterations": config.iterations,
+            "min_iterations": 50,
+        },
+        {},
+    )
+    if info["num_inliers"] < config.min_inliers or not np.isfinite(pose.t).all():
+        return "too_few_inliers"
+    return refine_pose(SE3(np.asarray(pose.R), np.asarray(pose.t)).inverse(), m, camera, config)
+
+
+def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> Pose | str:
+    """Iteratively reweighted least squares in pixels over all matches, then over the inliers alone.
+
+    A residual's covariance is sigma_px^2 I + J R^T cov R J^T: the map point's own uncertainty is in it. The covariance
+    is the inverse normal matrix, times the squared robust scale of the residuals where that is above one.
+    """
+    gate = config.threshold_sigmas
+    for sweep in range(SWEEPS):
+        r, J, size, _ = _whitened(T_map_cam, m, camera)
+        weight = np.where(size < gate, 1.0, 0.0) if sweep >= SWEEPS // 2 else _cauchy(size)
+        if (size < gate).sum() < config.min_inliers:
+            return "too_few_inliers"
+        H = np.einsum("nki,n,nkj->ij", J, weight, J)
+        step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -np.einsum("nki,n,nk->i", J, weight, r))
+        T_map_cam = T_map_cam @ SE3.exp(step)
+        if sweep > SWEEPS // 2 and np.abs(step).max() < 1e-9:
+            break
+    r, J, size, error_px = _whitened(T_map_cam, m, camera)
+    inlier = size < gate
+    if inlier.sum() < config.min_inliers:
+        return "too_few_inliers"
+    H = np.einsum("nki,nkj->ij", J[inlier], J[inlier])
+    eigen = np.linalg.eigvalsh(H)
+    depth = float(np.median((m.xyz[inlier] - T_map_cam.t) @ T_map_cam.R[:, 2]))
+    if eigen[0] <= 1e-12 * eigen[-1]:
+        return "degenerate"
+    # Median length of a residual with two degrees of freedom is 1.1774 sigma (Rayleigh).
+    scale = max(1.0, float(np.median(size[inlier])) / 1.1774)
+    degrees = len(r[inlier]) * 2 / max(len(r[inlier]) * 2 - 6, 1)
+    cov = np.linalg.inv(H) * scale**2 * degrees * config.inflation
+    rms_sigmas = float(np.sqrt((size[inlier] ** 2).mean() / 2))
+    if rms_sigmas > config.max_rms_sigmas:
+        return "high_residual"
+    if np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]) > config.max_sigma_ratio * depth:
+        return "degenerate"
+    return Pose(T_map_cam, (cov + cov.T) / 2, inlier, float(np.sqrt((error_px[inlier] ** 2).mean())), rms_sigmas)
+
+
+def _whitened(T: SE3, m: Points2D3D, camera: Camera) -> tuple[Array, Array, Array, Array]:
+    """Residual (N, 2) and Jacobian (N, 2, 6) in sigmas, Mahalanobis length (N,), pixel error (N,); invalid = infinite."""
+    x_cam = (m.xyz - T.t) @ T.R
+    uv, valid, J_cam = camera.project_with_jacobian(x_cam)
+    valid &= np.isfinite(J_cam).all(axis=(1, 2))
+    J_cam = np.where(valid[:, None, None], J_cam, 0.0)
+    error = np.where(valid[:, None], uv - m.uv, 0.0)
+    J_map = J_cam @ T.R.T
+    S = np.einsum("nij,njk,nlk->nil", J_map, m.cov, J_map) + (m.sigma_px**2)[:, None, None] * np.eye(2)
+    # Inverse Cholesky factor of each 2 x 2 by hand: L^-1 with S = L L^T.
+    a = np.sqrt(S[:, 0, 0])
+    b = S[:, 0, 1] / a
+    c = np.sqrt(np.maximum(S[:, 1, 1] - b * b, 1e-12))
+    W = np.zeros_like(S)
+    W[:, 0, 0], W[:, 1, 0], W[:, 1, 1] = 1 / a, -b / (a * c), 1 / c
+    J = W @ J_cam @ np.concatenate([hat(x_cam), -np.broadcast_to(np.eye(3), (len(x_cam), 3, 3))], axis=2)
+    r = np.einsum("nij,nj->ni", W, error)
+    size = np.where(valid, np.linalg.norm(r, axis=1), np.inf)
+    return r, J, size, np.where(valid, np.linalg.norm(error, axis=1), np.inf)
+
+
+def _cauchy(size: Array) -> Array:
+    return np.asarray(1 / (1 + (size / 2.0) ** 2))
+
+

@@ -1,0 +1,95 @@
+"""Tracks of posed keyframes by descriptor matching, checked against the epipolar geometry that the poses give."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from xalign_ros.core.descriptors import nearest
+from xalign_ros.core.lie import Array
+from xalign_ros.core.records import Keyframe
+from xalign_ros.core.transforms import SE3
+
+RATIO = 0.85
+SEQUENTIAL = 4  # following keyframes that every keyframe is matched with
+SPATIAL = 8  # nearest keyframes that look the same way
+MAX_VIEW_RAD = np.deg2rad(60.0)
+EPIPOLAR_PX = 8.0  # at twice the keypoint noise this still leaves room for a degree of pose error
+
+
+def matched_tracks(keyframes: Sequence[Keyframe], poses: Sequence[SE3]) -> np.ndarray:
+    """Track (F,) of every feature of all keyframes in order, -1 = none; no track has two features of one keyframe."""
+    sizes = [len(k.features) for k in keyframes]
+    offset = np.r_[0, np.cumsum(sizes)]
+    rays = [_rays(k) for k in keyframes]
+    links = [
+        offset[[a, b]][:, None] + _pair(keyframes[a], keyframes[b], rays[a], rays[b], poses[a].inverse() @ poses[b])
+        for a, b in _pairs(poses)
+    ]
+    link = np.concatenate(links, axis=1) if links else np.zeros((2, 0), np.int64)
+    graph = coo_array((np.ones(link.shape[1], bool), (link[0], link[1])), shape=(offset[-1], offset[-1]))
+    _, track = connected_components(graph, directed=False)
+    linked = np.zeros(offset[-1], bool)
+    linked[link.ravel()] = True
+    track = np.where(linked, track, -1)
+    track[seen_twice(track, np.repeat(np.arange(len(sizes)), sizes))] = -1
+    return track
+
+
+def seen_twice(track: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """Observations (F,) bool of a track that has two in one keyframe: at least one of them is wrong."""
+    order = np.lexsort((frame, track))
+    same = (np.diff(track[order]) == 0) & (np.diff(frame[order]) == 0) & (track[order][1:] >= 0)
+    bad = np.zeros(len(track), bool)
+    bad[order[1:][same]] = True
+    bad[order[:-1][same]] = True
+    return bad
+
+
+def _pairs(poses: Sequence[SE3]) -> list[tuple[int, int]]:
+    """Keyframe pairs worth matching: neighbours in time, and neighbours in space that look the same way."""
+    t, axis = np.array([T.t for T in poses]), np.array([T.R[:, 2] for T in poses])
+    found = set()
+    for a in range(len(poses)):
+        found.update((a, b) for b in range(a + 1, min(a + 1 + SEQUENTIAL, len(poses))))
+        alike = np.flatnonzero(axis @ axis[a] > np.cos(MAX_VIEW_RAD))
+        near = alike[np.argsort(np.linalg.norm(t[alike] - t[a], axis=1), kind="stable")]
+        found.update((min(a, int(b)), max(a, int(b))) for b in near[: SPATIAL + 1] if b != a)
+    return sorted(found)
+
+
+def _rays(keyframe: Keyframe) -> Array:
+    assert keyframe.camera is not None
+    return keyframe.camera.unproject(keyframe.features.uv)[0]
+
+
+def _pair(a: Keyframe, b: Keyframe, rays_a: Array, rays_b: Array, T_a_b: SE3) -> np.ndarray:
+    """Matched rows (2, N): mutually nearest, passing the ratio test both epipolar and by descriptor."""
+    if len(a.features) < 2 or len(b.features) < 2:
+        return np.zeros((2, 0), np.int64)
+    norm = a.features.norm
+    forth, distance = nearest(a.features.descriptors, b.features.descriptors, norm, 2)
+    back, _ = nearest(b.features.descriptors, a.features.descriptors, norm, 1)
+    rows = np.arange(len(forth))
+    keep = (back[forth[:, 0], 0] == rows) & (distance[:, 0] <= RATIO * distance[:, 1])
+    i, j = rows[keep], forth[keep, 0]
+    assert a.camera is not None
+    return np.stack([i, j])[:, _epipolar_rad(rays_a[i], rays_b[j], T_a_b) < EPIPOLAR_PX / a.camera.K[:2].mean()]
+
+
+def _epipolar_rad(ray_a: Array, ray_b: Array, T_a_b: SE3) -> Array:
+    """Angle (N,) between the ray of a and the epipolar plane of the ray of b; behind the camera or opposite = inf."""
+    ray_b = ray_b @ T_a_b.R.T
+    baseline = T_a_b.t / max(float(np.linalg.norm(T_a_b.t)), 1e-12)
+    normal = np.cross(baseline, ray_b)
+    length = np.linalg.norm(normal, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        angle = np.arcsin(np.clip(np.abs(np.einsum("ij,ij->i", ray_a, normal)) / length, 0, 1))
+        # Along the baseline the plane is undefined; there the rays themselves must agree.
+        angle = np.where(length < 0.02, np.linalg.norm(ray_a - ray_b, axis=1), angle)
+        # Seen from the first camera a point moves away from where the second one went: cross products agree in sign.
+        ordered = np.einsum("ij,ij->i", np.cross(ray_a, ray_b), normal) * -1 <= 1e-3
+    return np.where(np.isfinite(angle) & ordered & (np.einsum("ij,ij->i", ray_a, ray_b) > 0), angle, np.inf)

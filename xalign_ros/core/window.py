@@ -1,0 +1,71 @@
+"""The sliding Sim(3) window: an incremental fixed-lag smoother whose leaving keyframes stay behind as their marginal."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from xalign_ros.core.config import Config
+from xalign_ros.core.gtsam_bridge import anchor_factor, edge_factor, from_gtsam, prior_factor, to_gtsam
+from xalign_ros.core.records import Anchor, RelativePose, Solution
+from xalign_ros.core.transforms import Sim3
+
+WEAK_ROTATION_RAD = 1.0
+WEAK_TRANSLATION = 1e3  # odometry units
+WEAK_LOG_SCALE = 1.0
+RELINEARIZE = 1e-3  # above it Huber weights go stale
+
+
+class Window:
+    """Keyframes are keyed by their place in the window's chain, 0, 1, 2, ...; ids are the caller's."""
+
+    def __init__(self, S_map_first: Sim3, keyframe_id: int, metric: bool, config: Config) -> None:
+        """Start with one node near S_map_first; only the scale of a metric odometry is believed, the rest is weak."""
+        params = gtsam.ISAM2Params()
+        params.setRelinearizeThreshold(RELINEARIZE)
+        params.relinearizeSkip = 1
+        params.findUnusedFactorSlots = True  # else the slots of marginalised factors are never used again
+        self._smoother = gtsam.IncrementalFixedLagSmoother(float(config.window.keyframes) - 0.5, params)
+        self._huber = config.window.huber
+        self._size = config.window.keyframes
+        self._key = 0
+        self._ids = [keyframe_id]
+        scale = config.odometry.metric_scale_sigma if metric else WEAK_LOG_SCALE
+        sigmas = np.r_[np.full(3, WEAK_ROTATION_RAD), np.full(3, WEAK_TRANSLATION), scale]
+        start = Sim3(S_map_first.R, S_map_first.t, 1.0) if metric else S_map_first
+        self._pending = gtsam.NonlinearFactorGraph()
+        self._values = gtsam.Values()
+        self._pending.push_back(prior_factor(start, 0, sigmas))
+        self._values.insert(0, to_gtsam(S_map_first))
+        self._newest = S_map_first
+
+    def __len__(self) -> int:
+        return len(self._ids)
+
+    def extend(self, edge: RelativePose) -> None:
+        """Add the next keyframe of the chain by its odometry edge; solve() makes it count."""
+        self._key += 1
+        self._newest = self._newest @ edge.T_i_j
+        self._pending.push_back(edge_factor(edge, self._key - 1, self._key))
+        self._values.insert(self._key, to_gtsam(self._newest))
+        self._ids.append(edge.j)
+        del self._ids[: -self._size]
+
+    def attach(self, anchor: Anchor, back: int = 0) -> None:
+        """Add an anchor to the keyframe `back` places behind the newest."""
+        self._pending.push_back(anchor_factor(anchor, self._key - back, self._newest.s, self._huber))
+
+    def solve(self, extra_updates: int = 0) -> Solution:
+        """Update with all that was added; the covariance is the newest keyframe's."""
+        stamps = {key: float(key) for key in self._values.keys()}  # noqa: SIM118 - gtsam.Values is no mapping
+        self._smoother.update(self._pending, self._values, stamps)
+        for _ in range(extra_updates):
+            self._smoother.update()
+        self._pending.resize(0)
+        self._values.clear()
+        estimate = self._smoother.calculateEstimate()
+        keys = sorted(estimate.keys())
+        poses = tuple(from_gtsam(estimate.atSimilarity3(k)) for k in keys)
+        self._newest = poses[-1]
+        cov = self._smoother.marginalCovariance(self._key)
+        return Solution(tuple(self._ids[-len(keys) :]), poses, self._ids[-1], (cov + cov.T) / 2)

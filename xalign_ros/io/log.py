@@ -1,0 +1,283 @@
+"""Logs: reading MCAP files, rosbag2 folders and files, and ROS 1 bags; writing MCAP with the rosbag2 profile."""
+
+from __future__ import annotations
+
+import heapq
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache, lru_cache
+from operator import itemgetter
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import zstandard
+from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import Connection, ConnectionExtRosbag1, ConnectionExtRosbag2, MessageDefinitionFormat
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from xalign_ros.core.errors import LogError, XalignError
+from xalign_ros.core.records import Keyframe, Rejection
+from xalign_ros.io.log_files import reader_for, stored, translated, words
+from xalign_ros.io.messages import KEYFRAME, keyframe_from_message
+from xalign_ros.io.msgdefs import message_definitions
+
+HEADER = "std_msgs/msg/Header"
+LISTED = 12  # topics named in an error
+FOREVER = "sec: 9223372036\n    nsec: 854775807"
+# As the recorder writes it up to metadata version 8, the form which every later version reads too.
+QOS = f"""- history: 1
+  depth: {{depth}}
+  reliability: 1
+  durability: {{durability}}
+  deadline:
+    {FOREVER}
+  lifespan:
+    {FOREVER}
+  liveliness: 1
+  liveliness_lease_duration:
+    {FOREVER}
+  avoid_ros_namespace_conventions: false"""
+
+
+class Topic(NamedTuple):
+    name: str
+    type: str
+    messages: int
+
+
+class RawMessage(NamedTuple):
+    """One message as CDR bytes with encapsulation header, ready for a raw ROS 2 publisher."""
+
+    topic: str
+    type: str
+    log_time_ns: int
+    data: bytes
+
+
+@cache
+def typestore() -> Typestore:
+    """The ROS 2 types and those of xalign_msgs, for logs without ROS. Shared: register nothing more in it."""
+    newest = next(name for name in ("ROS2_KILTED", "ROS2_JAZZY", "ROS2_HUMBLE") if hasattr(Stores, name))
+    store = get_typestore(Stores[newest])
+    store.register({k: v for name, text in message_definitions().items() for k, v in _parsed(text, name).items()})
+    return store
+
+
+def _parsed(text: str, name: str) -> dict[str, Any]:
+    return dict(get_types_from_msg(text, name))
+
+
+class Log:
+    """A log open for reading, as context manager. Everything that is wrong with it is a LogError."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._stack = ExitStack()
+        self._storages: list[Any] = []
+        self._announced: dict[tuple[str, str], int] = {}
+        self._unpack: Callable[[bytes], bytes] = bytes
+
+    def __enter__(self) -> Log:
+        with ExitStack() as stack, translated(self.path):
+            reader = reader_for(self.path)
+            try:
+                reader.open()
+            except Exception:
+                parts = self.path.iterdir() if self.path.is_dir() else ()
+                for part in sorted(p for p in parts if p.suffix in (".mcap", ".db3")):
+                    reader_for(part)  # says it better, if it is this one
+                raise
+            stack.callback(reader.close)
+            self._storages = [reader]
+            if isinstance(reader, DirectoryReader):
+                # Its own messages() leaves out, silently, each topic whose QoS is told differently in metadata.yaml.
+                self._storages = list(reader.storages)
+                if reader.metadata.compression_mode == "message":
+                    self._unpack = zstandard.decompress
+                for storage in self._storages:
+                    reader_for(storage.path)
+            self._announced = {
+                **_counts(c for s in self._storages for c in s.connections),
+                **_counts(reader.connections),
+            }
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def topics(self) -> list[Topic]:
+        """All topics by name, with the number of messages the log announces."""
+        return [Topic(name, kind, count) for (name, kind), count in sorted(self._announced.items())]
+
+    def keyframe_topic(self, asked: str | None = None) -> str:
+        """The topic of xalign_msgs/msg/Keyframe: the asked one (a leading slash does not matter) or the only one."""
+        names = [topic.name for topic in self.topics() if topic.type == KEYFRAME]
+        if asked is not None:
+            fitting = [name for name in names if name.strip("/") == asked.strip("/")]
+            if not fitting:
+                raise LogError(f"{self.path} has no topic '{asked}' of type {KEYFRAME}; it has {self._listing()}")
+            return asked if asked in fitting else fitting[0]
+        if not names:
+            raise LogError(f"{self.path} has no topic of type {KEYFRAME}; it has {self._listing()}")
+        if len(names) > 1:
+            raise LogError(f"{self.path} has several keyframe topics, pick one by --keyframe-topic: {', '.join(names)}")
+        return names[0]
+
+    def keyframes(self, topic: str | None = None) -> Iterator[tuple[int, Keyframe | None, Rejection | None]]:
+        """(log time in ns, then what `keyframe_from_message` says), by log time; equal times in the order of the file.
+
+        Raises LogError where bytes are damaged or fewer messages come than the log announces.
+        """
+        for connection, time_ns, data in self._read({(self.keyframe_topic(topic), KEYFRAME)}):
+            with self._named(connection, time_ns):
+                message = self._store(connection).deserialize_cdr(self._cdr(connection, data), KEYFRAME)
+            yield time_ns, *keyframe_from_message(message)
+
+    def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
+        """The messages of `topics` (exact names; None = all) by log time; those of ROS 1 are converted to CDR."""
+        known = set(self._announced)
+        wanted = known if topics is None else {(name, kind) for name, kind in known if name in set(topics)}
+        for connection, time_ns, data in self._read(wanted):
+            with self._named(connection, time_ns):
+                cdr = self._cdr(connection, data)
+            yield RawMessage(connection.topic, connection.msgtype, time_ns, cdr)
+
+    def _read(self, wanted: set[tuple[str, str]]) -> Iterator[tuple[Connection, int, bytes]]:
+        streams = []
+        for storage in self._storages:
+            mine = [c for c in storage.connections if (c.topic, c.msgtype) in wanted]
+            for c in mine:
+                if isinstance(c.ext, ConnectionExtRosbag2) and c.ext.serialization_format != "cdr":
+                    raise LogError(f"{self.path} holds {c.topic} as {c.ext.serialization_format}, not as CDR")
+            if mine:
+                streams.append(stored(storage, mine))
+        delivered = 0
+        with translated(self.path):
+            for connection, time_ns, data in heapq.merge(*streams, key=itemgetter(1)):
+                delivered += 1
+                yield connection, time_ns, self._unpack(data)
+        announced = sum(self._announced[key] for key in wanted)
+        if delivered != announced:
+            names = ", ".join(sorted(name for name, _ in wanted)[:LISTED])
+            told = f"announces {announced} messages on {names} but delivers {delivered}"
+            raise LogError(f"{self.path} {told}: reindex it (`ros2 bag reindex`, `mcap recover`)")
+
+    def _cdr(self, connection: Connection, data: bytes) -> bytes:
+        if isinstance(connection.ext, ConnectionExtRosbag1):
+            return bytes(self._store(connection).ros1_to_cdr(data, connection.msgtype))
+        return data
+
+    def _store(self, connection: Connection) -> Typestore:
+        """The type as the log defines it, else as we do."""
+        definition = connection.msgdef
+        if definition.format is not MessageDefinitionFormat.MSG or not definition.data.strip():
+            return typestore()
+        store, difference = _embedded(connection.msgtype, definition.data)
+        if difference:
+            raise LogError(f"{self.path} has another {difference}")
+        return store
+
+    @contextmanager
+    def _named(self, connection: Connection, time_ns: int) -> Iterator[None]:
+        try:
+            yield
+        except XalignError:
+            raise
+        except Exception as error:
+            where = f"the message on {connection.topic} at {time_ns} ns"
+            raise LogError(f"{self.path} is damaged: {where} is no {connection.msgtype}: {words(error)}") from error
+
+    def _listing(self) -> str:
+        told = [f"{t.name} ({t.type}, {t.messages})" for t in self.topics()]
+        more = f" and {len(told) - LISTED} more" if len(told) > LISTED else ""
+        return ", ".join(told[:LISTED]) + more if told else "no topics at all"
+
+
+@lru_cache(maxsize=32)
+def _embedded(kind: str, text: str) -> tuple[Typestore, str]:
+    """The store of a definition that a log carries, and in which part a Keyframe differs from ours."""
+    store, types = get_typestore(Stores.EMPTY), _parsed(text, kind)
+    if HEADER in types:
+        types[HEADER] = typestore().fielddefs[HEADER]  # that of ROS 1 has a seq, which the conversion to CDR drops
+    store.register(types)
+    for name in sorted(types) if kind == KEYFRAME else ():
+        theirs, ours = (_fields(known.fielddefs.get(name, ((), ()))[1]) for known in (store, typestore()))
+        if ours != theirs:
+            return store, f"{name} than we know: {' '.join(field for field, _ in theirs)}"
+    return store, ""
+
+
+def _fields(entries: Iterable[tuple[str, Any]]) -> list[tuple[str, Any]]:
+    return [(name.lower() if name in tuple("DKRP") else name, what) for name, what in entries]  # of ROS 1's CameraInfo
+
+
+def _counts(connections: Iterable[Connection]) -> dict[tuple[str, str], int]:
+    counts: Counter[tuple[str, str]] = Counter()
+    for c in connections:
+        counts[c.topic, c.msgtype] += c.msgcount
+    return dict(counts)
+
+
+class LogWriter:
+    """An MCAP file in the making, as context manager: it gets its name only when all went well.
+
+    Topics in `latched` are told as transient local. Same calls, same bytes. Raises LogError where it cannot be written.
+    """
+
+    def __init__(self, path: str | Path, latched: Iterable[str] = ("state",)) -> None:
+        self.path = Path(path)
+        self._temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
+        self._latched = frozenset(latched)
+        self._channels: dict[tuple[str, str], int] = {}
+        self._written: Counter[int] = Counter()
+
+    def __enter__(self) -> LogWriter:
+        with self._writing():
+            self._file = self._temporary.open("wb")
+        self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
+        self._mcap.start(profile="ros2", library="xalign")
+        return self
+
+    def channel(self, topic: str, typename: str) -> int:
+        """Makes `topic` known, even if nothing is ever written to it."""
+        if (topic, typename) not in self._channels:
+            text = typestore().generate_msgdef(typename, ros_version=2)[0].encode()
+            schema = self._mcap.register_schema(typename, "ros2msg", text)
+            latched = topic in self._latched
+            qos = QOS.format(depth=1 if latched else 10, durability=1 if latched else 2)
+            metadata = {"offered_qos_profiles": qos, "topic_type_hash": typestore().hash_rihs01(typename)}
+            self._channels[topic, typename] = self._mcap.register_channel(topic, "cdr", schema, metadata)
+        return self._channels[topic, typename]
+
+    def write(self, topic: str, typename: str, message: Any, log_time_ns: int) -> None:
+        """Appends a message of the classes in `typestore()`."""
+        channel = self.channel(topic, typename)
+        data = bytes(typestore().serialize_cdr(message, typename))
+        with self._writing():
+            self._mcap.add_message(channel, log_time_ns, data, log_time_ns, self._written[channel])
+        self._written[channel] += 1
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, where: TracebackType | None) -> None:
+        try:
+            with self._writing(), self._file:
+                if kind is None:
+                    self._mcap.finish()
+            if kind is None:
+                with self._writing():
+                    os.replace(self._temporary, self.path)
+        finally:
+            with suppress(OSError):
+                self._temporary.unlink()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise LogError(f"{self.path} cannot be written: {error.strerror or error}") from error
