@@ -62,9 +62,16 @@ class Aligner:
         self._anchored: _Link | None = None  # the last keyframe whose anchor was accepted
         self._unlocked = state, reason
 
-    def step(self, keyframe: Keyframe, fault: Rejection | None = None) -> Step:
-        """Take one keyframe; `fault` is what reading its message already found wrong with its features."""
+    def step(self, keyframe: Keyframe | None, fault: Rejection | None = None) -> Step:
+        """Take one keyframe; `fault` is what reading its message found wrong with its features, or with all of it.
+
+        Raises ValueError when both are None.
+        """
         self._counts["keyframes"] += 1
+        if keyframe is None:
+            if fault is None:
+                raise ValueError("step needs a keyframe or the fault that left none")
+            return self._step(fault)
         earlier = [link.keyframe for link in self._links]
         last = earlier[-1] if earlier else None
         if last and (keyframe.session > last.session or (keyframe.session < last.session and keyframe.stamp_ns > last.stamp_ns)):
@@ -72,7 +79,7 @@ class Aligner:
             earlier, last = [], None
         refused = refusal(keyframe, earlier, self.index.map)
         if refused is not None and not carries_pose(refused):
-            return self._step(keyframe, refused, None, None)
+            return self._step(refused)
         edge = edge_between(last, keyframe, self._scale(), self.config.odometry) if last else None
         predicted = predict(self._solution, edge) if self._solution and edge else None
         self._remember(keyframe, edge)
@@ -86,7 +93,7 @@ class Aligner:
         if isinstance(found, Anchor):
             self._links[-1].accepted = True
             self._anchored = self._links[-1]
-        return self._step(keyframe, found, predicted, self._correction(keyframe))
+        return self._step(found, predicted, self._correction(keyframe))
 
     # -- parts of a step, in order -------------------------------------------------------------------------------
 
@@ -192,17 +199,17 @@ class Aligner:
         return Correction(*who, S_map_odom, cov, T_map_cam, self._pose_cov())
 
     def _step(
-        self, keyframe: Keyframe, found: Anchor | Rejection, predicted: Prediction | None, correction: Correction | None
+        self, found: Anchor | Rejection, predicted: Prediction | None = None, correction: Correction | None = None
     ) -> Step:
         rejection = found if isinstance(found, Rejection) else None
         self._counts["accepted"] += rejection is None
         self._counts["rejected"] += rejection is not None and rejection.reason not in INPUT_REASONS
         solution = self._solution
         return Step(
-            keyframe.id,
-            keyframe.session,
-            keyframe.stamp_ns,
-            self._state(keyframe),
+            found.keyframe_id,
+            found.session,
+            found.stamp_ns,
+            self._state(found.session, found.stamp_ns),
             correction,
             found if isinstance(found, Anchor) else None,
             rejection,
@@ -210,7 +217,7 @@ class Aligner:
             tuple((k, S.rigid_pose()) for k, S in zip(solution.keys, solution.S_map_i, strict=True)) if solution else (),
         )
 
-    def _state(self, keyframe: Keyframe) -> AlignmentState:
+    def _state(self, session: int, stamp_ns: int) -> AlignmentState:
         since_s, since_m = self._since_anchor() if self._links else (float("nan"), float("nan"))
         state, reason, probability, S_map_odom, sigma = *self._unlocked, 0.0, None, float("nan")
         if self._solution is not None:
@@ -226,8 +233,8 @@ class Aligner:
             state=state,
             reason=reason,
             score=probability,
-            session=keyframe.session,
-            stamp_ns=keyframe.stamp_ns,
+            session=session,
+            stamp_ns=stamp_ns,
             S_map_odom=S_map_odom,
             scale_sigma=sigma,
             metric_scale=sigma < self.config.status.metric_sigma,

@@ -43,13 +43,15 @@ class Camera:
             raise ValueError(f"{self.model} takes {MODELS[self.model]} coefficients, not {len(self.D)}")
         if not (np.isfinite(self.K).all() and np.isfinite(self.D).all() and (self.K[:2] > 0).all()):
             raise ValueError(f"camera has no usable intrinsics: K = {self.K.tolist()}, D = {self.D.tolist()}")
+        if self.model == "fov" and not 0 < self.D[0] < np.pi:
+            raise ValueError(f"fov's coefficient is {self.D[0]:g} rad, needed is an angle between 0 and pi")
         if self.width <= 0 or self.height <= 0:
             raise ValueError(f"camera image is {self.width} x {self.height} px")
         object.__setattr__(self, "limit", self._monotonic_limit())
 
     def _monotonic_limit(self) -> float:
         if self.model == "fov":
-            return MAX_ANGLE_RAD if 0 < self.D[0] < np.pi else 0.0
+            return float(MAX_ANGLE_RAD)
         if self.model == "equidistant":
             x = np.linspace(0, MAX_ANGLE_RAD, 2000)
             y = x * np.polyval([*self.D[::-1], 1.0], x * x)

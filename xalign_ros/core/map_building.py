@@ -15,7 +15,7 @@ from xalign_ros.core.pnp import Points2D3D, Pose, refine_pose
 from xalign_ros.core.records import NO_TRACK, Keyframe, Norm
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.tracks import matched_tracks, seen_twice
-from xalign_ros.core.transforms import SE3
+from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.core.triangulation import Triangulated, triangulate
 
 FOLDS = 5
@@ -23,18 +23,21 @@ KEYPOINT_SIGMA_PX = 0.5  # of a good detector; what residuals have above it the 
 START_SIGMA_PX = 2.0  # before the map's own reprojection scale is known
 
 
-class _Observations:
+class Observations:
     """All features of all posed keyframes as arrays: frame (F,), uv (F, 2), ray (F, 3) in the map, centre (F, 3)."""
 
-    def __init__(self, keyframes: Sequence[Keyframe], poses: Sequence[SE3]) -> None:
-        sizes = [len(k.features) for k in keyframes]
+    def __init__(
+        self, cameras: Sequence[Camera], uv: Sequence[Array], descriptors: Sequence[np.ndarray], poses: Sequence[SE3]
+    ) -> None:
+        """One entry per keyframe in each sequence: uv (N, 2) px, descriptors (N, B), poses T_map_cam."""
+        sizes = [len(x) for x in uv]
         self.offset = np.r_[0, np.cumsum(sizes)].astype(np.int64)
-        self.frame = np.repeat(np.arange(len(keyframes)), sizes)
-        self.uv = np.concatenate([k.features.uv for k in keyframes])
-        self.descriptors = np.concatenate([k.features.descriptors for k in keyframes])
-        self.ray_cam = np.concatenate([_camera(k).unproject(k.features.uv)[0] for k in keyframes])
+        self.frame = np.repeat(np.arange(len(sizes)), sizes)
+        self.uv = np.concatenate(uv)
+        self.descriptors = np.concatenate(descriptors)
+        self.ray_cam = np.concatenate([c.unproject(x)[0] for c, x in zip(cameras, uv, strict=True)])
         self.valid = np.isfinite(self.ray_cam).all(axis=1)
-        self.focal = np.array([_camera(k).K[:2].mean() for k in keyframes])[self.frame]
+        self.focal = np.array([c.K[:2].mean() for c in cameras])[self.frame]
         self.move(poses)
 
     def move(self, poses: Sequence[SE3]) -> None:
@@ -61,9 +64,11 @@ def build_map(
         raise ValueError(f"{len(keyframes)} keyframes carry {len(kinds)} kinds of descriptors; a map needs exactly one")
     name, norm, _ = kinds.pop()
     keyframes, poses = zip(*[(k, T) for k, T in zip(keyframes, poses, strict=True) if len(k.features)], strict=True)
-    obs = _Observations(keyframes, poses)
+    features = [k.features for k in keyframes]
+    each = [_camera(k) for k in keyframes]
+    obs = Observations(each, [f.uv for f in features], [f.descriptors for f in features], poses)
     track = _track_ids(keyframes, obs) if _have_tracks(keyframes) else matched_tracks(keyframes, poses)
-    cameras, which = _distinct_cameras([_camera(k) for k in keyframes])
+    cameras, which = _distinct_cameras(each)
     return assemble_map(
         obs=obs,
         track=track,
@@ -81,7 +86,7 @@ def build_map(
 
 def assemble_map(
     *,
-    obs: _Observations,
+    obs: Observations,
     track: np.ndarray,
     cameras: tuple[Camera, ...],
     keyframe_camera: np.ndarray,
@@ -109,8 +114,49 @@ def assemble_map(
     new_index[points.kept] = np.arange(points.kept.sum())
     feature_point = np.full(len(obs.uv), -1, np.int32)
     feature_point[used] = np.where(points.inlier, new_index[compact], -1)
+    return map_of_points(
+        obs=obs,
+        given=given,
+        points=points.xyz[points.kept],
+        point_cov=points.cov[points.kept],
+        feature_point=feature_point,
+        sigma_px=sigma_px,
+        cameras=cameras,
+        keyframe_camera=keyframe_camera,
+        map_id=map_id,
+        source=source,
+        frame=frame,
+        metric=metric,
+        name=name,
+        norm=norm,
+    )
+
+
+def map_of_points(
+    *,
+    obs: Observations,
+    given: Sequence[SE3],
+    points: Array,
+    point_cov: Array,
+    feature_point: np.ndarray,
+    sigma_px: float,
+    cameras: tuple[Camera, ...],
+    keyframe_camera: np.ndarray,
+    map_id: str,
+    source: str,
+    frame: str,
+    metric: bool,
+    name: str,
+    norm: Norm,
+    S_map_refmap: Sim3 | None = None,
+) -> ReferenceMap:
+    """The map of M points as they are: a descriptor for each, the gate and the anchor sigma.
+
+    points (M, 3) m with point_cov (M, 3, 3); feature_point (F,) int32, -1 = none, every point seen at least once;
+    sigma_px of their reprojection; given are the poses (K,) that anchor_sigma is measured against, obs.poses the map's.
+    """
     seen = np.flatnonzero(feature_point >= 0)
-    medoid = nearest_to_mean(obs.descriptors[seen], feature_point[seen], int(points.kept.sum()), norm)
+    medoid = nearest_to_mean(obs.descriptors[seen], feature_point[seen], len(points), norm)
     descriptors = obs.descriptors[seen[medoid]]
     return ReferenceMap(
         map_id=map_id,
@@ -121,8 +167,8 @@ def assemble_map(
         descriptor_name=name,
         norm=norm,
         cameras=cameras,
-        points=points.xyz[points.kept],
-        point_cov=points.cov[points.kept].astype(np.float32),
+        points=points,
+        point_cov=point_cov.astype(np.float32),
         descriptors=descriptors,
         keyframe_R=np.array([T.R for T in obs.poses]),
         keyframe_t=np.array([T.t for T in obs.poses]),
@@ -134,29 +180,39 @@ def assemble_map(
         sigma_px=sigma_px,
         descriptor_gate=_descriptor_gate(obs.descriptors[seen], descriptors[feature_point[seen]], norm),
         anchor_sigma=_anchor_sigma(obs, feature_point, given, cameras, keyframe_camera, sigma_px),
+        S_map_refmap=S_map_refmap or Sim3.identity(),
     )
 
 
-def _triangulate_twice(obs: _Observations, used: np.ndarray, track: np.ndarray, count: int) -> tuple[Triangulated, float]:
+def _triangulate_twice(
+    obs: Observations, used: np.ndarray, track: np.ndarray, count: int
+) -> tuple[Triangulated, float]:
     """The second pass takes the reprojection scale that the first one found, so poor poses do not empty the map."""
     sigma_px = START_SIGMA_PX
     for _ in range(2):
         sigma_rad = sigma_px / obs.focal[used]
         points = triangulate(track, count, obs.centre[used], obs.ray[used], sigma_rad)
-        # A residual of two degrees of freedom: the median of its length is 1.1774 sigma (Rayleigh).
-        length = points.residual[points.inlier] * sigma_px
-        degrees = max(1 - 1.5 * points.kept.sum() / max(len(length), 1), 0.25)  # 3 of 2n numbers go into the point
-        sigma_px = float(np.clip(np.median(length) / 1.1774 / np.sqrt(degrees), KEYPOINT_SIGMA_PX, 4.0)) if len(length) else sigma_px
+        length_px = points.residual[points.inlier] * sigma_px
+        sigma_px = reprojection_sigma_px(length_px, int(points.kept.sum())) if len(length_px) else sigma_px
     return points, sigma_px
 
 
-def _bearings(obs: _Observations, used: np.ndarray, track: np.ndarray, points: Triangulated, sigma_px: float) -> Bearings:
+def reprojection_sigma_px(length_px: Array, points: int) -> float:
+    """Robust sigma of one axis from the lengths (O,) of residuals at `points` points, not below a detector's own."""
+    degrees = max(1 - 1.5 * points / len(length_px), 0.25)  # 3 of 2n numbers go into the point
+    # A residual of two degrees of freedom: the median of its length is 1.1774 sigma (Rayleigh).
+    return float(np.clip(np.median(length_px) / 1.1774 / np.sqrt(degrees), KEYPOINT_SIGMA_PX, 4.0))
+
+
+def _bearings(
+    obs: Observations, used: np.ndarray, track: np.ndarray, points: Triangulated, sigma_px: float
+) -> Bearings:
     rows = used[points.inlier]
     return Bearings(obs.frame[rows], track[points.inlier], obs.ray_cam[rows], sigma_px / obs.focal[rows])
 
 
 def _anchor_sigma(
-    obs: _Observations,
+    obs: Observations,
     track: np.ndarray,
     given: Sequence[SE3],
     cameras: tuple[Camera, ...],
@@ -194,8 +250,8 @@ def _anchor_sigma(
 def _descriptor_gate(observed: np.ndarray, of_point: np.ndarray, norm: Norm) -> float:
     """Distance that separates descriptors of one point from descriptors of two.
 
-    Half way (in standard deviations of both) between the distances within points, medoids themselves left out, and those
-    between random pairs.
+    Half way (in standard deviations of both) between the distances within points, medoids themselves left out, and
+    those between random pairs.
     """
     within = pair_distance(observed, of_point, norm)
     within = within[within > 0]
@@ -210,7 +266,7 @@ def _have_tracks(keyframes: Sequence[Keyframe]) -> bool:
     return all(k.features.track_ids is not None for k in keyframes)
 
 
-def _track_ids(keyframes: Sequence[Keyframe], obs: _Observations) -> np.ndarray:
+def _track_ids(keyframes: Sequence[Keyframe], obs: Observations) -> np.ndarray:
     """Track of every feature (F,), -1 = none; ids of different sessions are different tracks."""
     ids = np.concatenate([k.features.track_ids for k in keyframes if k.features.track_ids is not None])
     session = np.repeat([k.session for k in keyframes], np.diff(obs.offset))

@@ -17,7 +17,8 @@ from xalign_ros.core.lie import Array, hat
 from xalign_ros.core.transforms import SE3
 
 MAX_RAY_RAD = np.deg2rad(80.0)  # of a virtual pinhole
-SWEEPS = 10
+SWEEPS = 6  # at most, of each: Cauchy weights over all matches, then the inliers alone
+CAUCHY = 2.0  # standard deviations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,21 +77,23 @@ def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> P
     is the inverse normal matrix, times the squared robust scale of the residuals where that is above one.
     """
     gate = config.threshold_sigmas
-    for sweep in range(SWEEPS):
-        r, J, size, _ = _whitened(T_map_cam, m, camera)
-        weight = np.where(size < gate, 1.0, 0.0) if sweep >= SWEEPS // 2 else _cauchy(size)
-        if (size < gate).sum() < config.min_inliers:
-            return "too_few_inliers"
-        H = np.einsum("nki,n,nkj->ij", J, weight, J)
-        step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -np.einsum("nki,n,nk->i", J, weight, r))
-        T_map_cam = T_map_cam @ SE3.exp(step)
-        if sweep > SWEEPS // 2 and np.abs(step).max() < 1e-9:
-            break
+    for robust in (True, False):
+        for _ in range(SWEEPS):
+            r, J, size, _ = _whitened(T_map_cam, m, camera)
+            if (size < gate).sum() < config.min_inliers:
+                return "too_few_inliers"
+            weight = 1 / (1 + (size / CAUCHY) ** 2) if robust else np.where(size < gate, 1.0, 0.0)
+            Jw = J * weight[:, None, None]
+            H = np.tensordot(Jw, J, ((0, 1), (0, 1)))
+            step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -np.tensordot(Jw, r, ((0, 1), (0, 1))))
+            T_map_cam = T_map_cam @ SE3.exp(step)
+            if np.abs(step).max() < (1e-4 if robust else 1e-6):
+                break
     r, J, size, error_px = _whitened(T_map_cam, m, camera)
     inlier = size < gate
     if inlier.sum() < config.min_inliers:
         return "too_few_inliers"
-    H = np.einsum("nki,nkj->ij", J[inlier], J[inlier])
+    H = np.tensordot(J[inlier], J[inlier], ((0, 1), (0, 1)))
     eigen = np.linalg.eigvalsh(H)
     depth = float(np.median((m.xyz[inlier] - T_map_cam.t) @ T_map_cam.R[:, 2]))
     if eigen[0] <= 1e-12 * eigen[-1]:
@@ -126,9 +129,3 @@ def _whitened(T: SE3, m: Points2D3D, camera: Camera) -> tuple[Array, Array, Arra
     r = np.einsum("nij,nj->ni", W, error)
     size = np.where(valid, np.linalg.norm(r, axis=1), np.inf)
     return r, J, size, np.where(valid, np.linalg.norm(error, axis=1), np.inf)
-
-
-def _cauchy(size: Array) -> Array:
-    return np.asarray(1 / (1 + (size / 2.0) ** 2))
-
-

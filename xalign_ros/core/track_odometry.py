@@ -2,12 +2,10 @@
 
 Two-view start once the parallax allows it (five points: Nister 2004), then per frame PnP on the triangulated tracks and
 bundle adjustment of a sliding window, points eliminated (Triggs et al. 2000), the oldest frames held (Mouragnon et al.
-2006). Scale passes from step to step through tracks seen in three frames or more, so it drifts as it does in any
-monocular odometry. Points are unit homogeneous vectors: a track without parallax still gives rotation.
-
-Radial distortion left over by a calibration, invisible in one image, makes scale drift wherever the camera turns (for
-KITTI's: Cvisic et al., ECMR 2021). So two radial terms, the lens, are states of the window too. They are levelled: kept
-orthogonal to a change of focal length, which forward motion cannot tell from depth.
+2006). Scale passes on through tracks seen in three frames or more, so it drifts as in any monocular odometry. Points
+are unit homogeneous vectors: a track without parallax still gives rotation. The radial distortion that a calibration
+leaves over makes scale drift wherever the camera turns (KITTI's: Cvisic et al., ECMR 2021), so two radial terms, the
+lens, are states of the window, levelled against a change of focal length, which forward motion cannot tell from depth.
 """
 
 from __future__ import annotations
@@ -36,7 +34,6 @@ class TrackOdometryOptions:
     held: int = 4  # older frames beside them, held: they carry the gauge, scale included
     min_tracks: int = 15  # fewest inliers a pose may rest on (chance alone gives up to 8)
     start_parallax_rad: float = 0.01  # median parallax the two-view start waits for
-    outlier_sigmas: float = 12.0  # an observation beyond is dropped for good; below it the kernel decides
     iterations: int = 5  # of each window's adjustment; the windows overlap, so none needs to converge alone
 
 
@@ -60,7 +57,6 @@ class _World:
     frame: np.ndarray  # (M,)
     track: np.ndarray  # (M,) row of xyzw
     ray: Array  # (M,3)
-    good: np.ndarray  # (M,) bool, not found to be an outlier
     T_odom_cam: Array  # (F,4,4)
     xyzw: Array  # (P,4) unit homogeneous points in odom
     lens: _Lens
@@ -93,19 +89,19 @@ def odometry_from_tracks(
 def _world(rays: list[Array], track_ids: list[np.ndarray], opt: TrackOdometryOptions) -> _World:
     """The table of all observations, nothing solved yet."""
     for k, (ray, ids) in enumerate(zip(rays, track_ids, strict=True)):
-        if ids.ndim != 1 or ray.shape != (len(ids), 3) or len(np.unique(ids)) < len(ids):
-            raise ValueError(f"frame {k}: needed are rays (N, 3) and N different track ids, not {ray.shape}, {ids.shape}")
-        if not np.all(np.abs(np.linalg.norm(ray, axis=1) - 1.0) < 1e-6):
-            raise ValueError(f"frame {k}: a bearing is not a unit vector")
+        fits = ray.shape == (*ids.shape, 3) and ids.ndim == 1 and len(np.unique(ids)) == len(ids)
+        if not fits or not np.all(np.abs(np.linalg.norm(ray, axis=1) - 1.0) < 1e-6):
+            raise ValueError(f"frame {k}: needed are unit bearings (N, 3) and N different track ids (N,)")
     frame = np.repeat(np.arange(len(rays)), [len(ids) for ids in track_ids])
-    tracks, track = np.unique(np.concatenate([*track_ids, np.empty(0, np.int64)]), return_inverse=True)
+    ids_of_all = np.concatenate([np.empty(0, np.int64), *(ids.astype(np.int64) for ids in track_ids)])
+    tracks, track = np.unique(ids_of_all, return_inverse=True)
     T_odom_cam = np.full((len(rays), 4, 4), np.nan)
     T_odom_cam[:1] = np.eye(4)
     ray = np.concatenate([*rays, np.empty((0, 3))])
-    s2 = np.square(ray[frame == 0, :2]).sum(axis=1)  # the first frame's alone: causal
+    s2 = np.square(ray[frame == 0, :2]).sum(axis=1)  # first frame only: causal
     level = np.array([(s2**2).sum(), (s2**3).sum()]) / max(s2.sum(), 1e-9)
     lens = _Lens(np.zeros(2), np.eye(2) / max(opt.sigma_lens, 1e-9) ** 2, level)
-    return _World(frame, track, ray, np.ones(len(ray), bool), T_odom_cam, np.full((len(tracks), 4), np.nan), lens)
+    return _World(frame, track, ray, T_odom_cam, np.full((len(tracks), 4), np.nan), lens)
 
 
 def _start(world: _World, k: int, draw: int, opt: TrackOdometryOptions) -> None:
@@ -121,20 +117,17 @@ def _start(world: _World, k: int, draw: int, opt: TrackOdometryOptions) -> None:
     ray_ref, ray_k = world.ray[a[i[front]]], world.ray[b[j[front]]]
     ransac = {"max_epipolar_error": 4.0 * opt.sigma_rad * FOCAL_PX, "seed": draw}
     pose, found = poselib.estimate_relative_pose(_pixels(ray_ref), _pixels(ray_k), PINHOLE, PINHOLE, ransac, {})
-    inlier, T_ref_k = np.array(found["inliers"], bool), _inverse(pose)
+    inlier, T_ref_k = np.array(found["inliers"], bool), np.linalg.inv([*pose.Rt, [0, 0, 0, 1]])
     if inlier.sum() < opt.min_tracks:
         return
     parallax_rad = np.median(np.linalg.norm(ray_k[inlier] @ T_ref_k[:3, :3].T - ray_ref[inlier], axis=1))
     near = parallax_rad < opt.start_parallax_rad
     T_ref_k[:3, 3] *= 0.0 if near else 1.0 / np.linalg.norm(T_ref_k[:3, 3])
     world.T_odom_cam[k] = world.T_odom_cam[ref] @ T_ref_k
-    if near:
-        return
-    world.start = (int(ref), k)
-    world.T_odom_cam[ref + 1 : k] = np.nan  # emitted as rotations; posed now that there are points
-    _refine(world, k, opt)
-    for m in range(ref + 1, k):
-        _locate(world, m, draw, opt)
+    if not near:
+        world.T_odom_cam[ref + 1 : k] = np.nan  # emitted, but rotations alone: not for the window
+        world.start = (int(ref), k)
+        _refine(world, k, opt)
 
 
 def _locate(world: _World, k: int, draw: int, opt: TrackOdometryOptions) -> bool:
@@ -149,26 +142,17 @@ def _locate(world: _World, k: int, draw: int, opt: TrackOdometryOptions) -> bool
     pose, found = poselib.estimate_absolute_pose(pixels, xyzw[:, :3] / xyzw[:, 3:], PINHOLE, ransac, {})
     if found["num_inliers"] < opt.min_tracks:
         return False
-    world.T_odom_cam[k] = _inverse(pose)
+    world.T_odom_cam[k] = np.linalg.inv([*pose.Rt, [0, 0, 0, 1]])
     return True
-
-
-def _inverse(pose: poselib.CameraPose) -> Array:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = pose.R.T, -pose.R.T @ pose.t
-    return T
 
 
 def _pixels(ray: Array) -> Array:
     return np.ascontiguousarray(FOCAL_PX * ray[:, :2] / ray[:, 2:])
 
 
-# The window. Arrays have the observation or point last, (3,M), so that NumPy's inner loops are long.
-
-
 @dataclass(frozen=True, slots=True)
 class _Window:
-    """The observations of a window, sorted by point, about to be adjusted."""
+    """Observations to adjust, sorted by point; arrays here have them last, (3,M), for long inner loops in NumPy."""
 
     held: np.ndarray  # (W,) bool, frames that do not move
     frame: np.ndarray  # (M,)
@@ -180,21 +164,8 @@ class _Window:
     sigma_rad: float
 
 
-class _Estimate(NamedTuple):
-    T: Array  # (W,4,4)
-    xyzw: Array  # (4,P)
-    lens: Array  # (2,)
-
-
-class _Linear(NamedTuple):
-    """Bearing errors in the tangent planes of the corrected bearings, with derivatives, all weighted by the kernel."""
-
-    cost: float
-    error_rad: Array  # (M,) not weighted
-    error: Array  # (2,M)
-    by_point: Array  # (2,3,M) along the axes (3,4,P) of turn
-    by_rest: Array  # (2,8,M) rotation, translation, lens; perturbation on the right
-    turn: Array
+_Estimate = tuple[Array, Array, Array]  # T (W,4,4), xyzw (4,P), lens (2,)
+_Linear = tuple[float, Array, Array, Array, Array]  # see _linear
 
 
 def _refine(world: _World, k: int, opt: TrackOdometryOptions) -> None:
@@ -203,27 +174,32 @@ def _refine(world: _World, k: int, opt: TrackOdometryOptions) -> None:
     frames = np.flatnonzero(np.isfinite(world.T_odom_cam[: k + 1, 0, 0]))
     frames = frames[frames >= first_frame][-(opt.window + opt.held) :]
     held = np.arange(len(frames)) < max(1, len(frames) - opt.window)
-    rows = np.flatnonzero(world.good & np.isin(world.frame, frames))
+    rows = np.flatnonzero(np.isin(world.frame, frames))
     rows = rows[np.bincount(world.track[rows])[world.track[rows]] >= 2]
     rows = rows[np.argsort(world.track[rows], kind="stable")]
     tracks, first, point = np.unique(world.track[rows], return_index=True, return_inverse=True)
     frame, ray = np.searchsorted(frames, world.frame[rows]), np.ascontiguousarray(world.ray[rows].T)
     window = _Window(held, frame, point, first, ray, world.lens, world.lens.terms(ray), opt.sigma_rad)
-
-    T, xyzw = world.T_odom_cam[frames], world.xyzw[tracks].T
+    T, origin = world.T_odom_cam[frames], world.T_odom_cam[frames[0], :3, 3].copy()
+    T[:, :3, 3] -= origin  # points move straightest seen from near the cameras
+    xyzw = _moved(world.xyzw[tracks].T, -origin)
     xyzw = np.where(np.isnan(xyzw), _triangulated(window, T), xyzw)
-    (T, xyzw, lens), error_rad, information = _adjusted(window, _Estimate(T, xyzw, world.lens.value), opt.iterations)
-    if held.sum() == 1 and frames[0] == first_frame:  # one held frame, at the origin, leaves scale free
+    (T, xyzw, lens), information = _adjusted(window, (T, xyzw, world.lens.value), opt.iterations)
+    if held.sum() == 1 and frames[0] == first_frame:  # one held frame leaves scale free: the first baseline stays 1
         baseline = np.linalg.norm(T[np.searchsorted(frames, second_frame), :3, 3])
         T[:, :3, 3] /= baseline
         xyzw[3] *= baseline
-
+    T[:, :3, 3] += origin
     world.T_odom_cam[frames] = T
-    world.good[rows] = error_rad < opt.outlier_sigmas * opt.sigma_rad
-    supported = np.add.reduceat(world.good[rows].astype(int), first) >= 2
-    world.xyzw[tracks] = np.where(supported, xyzw / np.linalg.norm(xyzw, axis=0), np.nan).T
+    world.xyzw[tracks] = _moved(xyzw, origin).T
     information = world.lens.information + information / opt.window  # since a frame is in so many windows
     world.lens = _Lens(lens, information, world.lens.level)
+
+
+def _moved(xyzw: Array, by: Array) -> Array:
+    """Homogeneous points (4,P) shifted by (3,), unit again."""
+    out = np.concatenate([xyzw[:3] + xyzw[3] * by[:, None], xyzw[3:]])
+    return np.asarray(out / np.linalg.norm(out, axis=0))
 
 
 def _stretched(ray: Array, by: Array) -> Array:
@@ -234,52 +210,50 @@ def _stretched(ray: Array, by: Array) -> Array:
 
 def _triangulated(window: _Window, T: Array) -> Array:
     """Unit homogeneous points (4,P) nearest to their rays (linear least squares), in front of most cameras."""
-    ray, R = _stretched(window.ray, window.lens.value @ window.terms), T[window.frame, :3, :3]
-    direction, origin = np.einsum("nij,jn->ni", R, ray), T[0, :3, 3]
-    centre = (T[:, :3, 3:] - origin[:, None])[window.frame]  # small numbers, since the normal matrix squares them
-    shift = np.concatenate([np.broadcast_to(np.eye(3), R.shape), -centre], axis=2)
+    ray, T = _stretched(window.ray, window.lens.value @ window.terms), T[window.frame]
+    direction = np.einsum("nij,jn->ni", T[:, :3, :3], ray)
+    shift = np.concatenate([np.broadcast_to(np.eye(3), (len(T), 3, 3)), -T[:, :3, 3:]], axis=2)
     off_ray = shift - direction[:, :, None] * (direction[:, None] @ shift)
     xyzw = np.linalg.eigh(np.add.reduceat(off_ray.transpose(0, 2, 1) @ off_ray, window.first))[1][:, :, 0]
     depth = np.einsum("ni,nij,nj->n", direction, shift, xyzw[window.point])
-    xyzw *= np.where(np.add.reduceat(depth, window.first) < 0.0, -1.0, 1.0)[:, None]
-    xyzw[:, :3] += xyzw[:, 3:] * origin
-    return np.asarray((xyzw / np.linalg.norm(xyzw, axis=1, keepdims=True)).T)
+    return np.asarray((xyzw * np.where(np.add.reduceat(depth, window.first) < 0.0, -1.0, 1.0)[:, None]).T)
 
 
-def _adjusted(window: _Window, estimate: _Estimate, iterations: int) -> tuple[_Estimate, Array, Array]:
-    """Levenberg-Marquardt; also the errors (M,) in rad and what this window alone knows of the lens (2,2)."""
+def _adjusted(window: _Window, estimate: _Estimate, iterations: int) -> tuple[_Estimate, Array]:
+    """Levenberg-Marquardt; also what this window alone knows of the lens, an information (2,2)."""
     damping, linear, information = 1e-4, _linear(window, estimate), np.zeros((2, 2))
     for _ in range(iterations):
         trial, information = _step(window, estimate, linear, damping)
         trial_linear = _linear(window, trial)
-        if trial_linear.cost < linear.cost:
+        if trial_linear[0] < linear[0]:
             estimate, linear, damping = trial, trial_linear, max(0.1 * damping, 1e-8)
         else:
             damping *= 10.0
-    return estimate, linear.error_rad, information
+    return estimate, information
 
 
 def _linear(window: _Window, estimate: _Estimate) -> _Linear:
-    """Residuals under a Cauchy kernel, with their derivatives."""
-    ray = _stretched(window.ray, estimate.lens @ window.terms)
-    T, x = estimate.T.transpose(1, 2, 0)[:, :, window.frame], estimate.xyzw[:, window.point]
+    """Cost; bearing errors (2,M) in the tangent planes of the corrected bearings; their derivatives by point (2,3,M)
+    and by rotation, translation, lens (2,8,M), all Cauchy-weighted; the axes (3,4,P) along which points move."""
+    T, xyzw, lens = estimate
+    T, x = T.transpose(1, 2, 0)[:, :, window.frame], xyzw[:, window.point]
+    ray = _stretched(window.ray, lens @ window.terms)
     x_cam = np.einsum("jin,jn->in", T[:3, :3], x[:3] - x[3] * T[:3, 3])
     length = np.linalg.norm(x_cam, axis=0)
     bearing, across = x_cam / length, _axes_across(ray)
     error = np.einsum("kin,in->kn", across, bearing)
     error[:, np.einsum("in,in->n", bearing, ray) <= 0.0] = 1.0  # behind the camera: an outlier, not a small error
-    error2, lens = np.einsum("kn,kn->n", error, error), estimate.lens - window.lens.value
+    error2, lens = np.einsum("kn,kn->n", error, error), lens - window.lens.value
     cost = np.log1p(error2 / window.sigma_rad**2).sum() + lens @ window.lens.information @ lens
-
     weight = 1.0 / np.sqrt(window.sigma_rad**2 + error2)  # root of Cauchy's
-    across, turn = across * weight, _axes_across(estimate.xyzw)
+    across, turn = across * weight, _axes_across(xyzw)
     by_cam = (across - np.einsum("kin,in->kn", across, bearing)[:, None] * bearing) / length
     by_odom = np.einsum("kin,jin->kjn", by_cam, T[:3, :3])
     by_xyzw = np.concatenate([by_odom, -np.einsum("kjn,jn->kn", by_odom, T[:3, 3])[:, None]], axis=1)
     by_point = np.einsum("kin,jin->kjn", by_xyzw, turn[:, :, window.point])
     by_lens = -np.einsum("kin,in->kn", across[:, :2], window.ray[:2])[:, None] * window.terms
     by_rest = np.concatenate([np.cross(across, bearing[None], axis=1), -x[3] * by_cam, by_lens], axis=1)
-    return _Linear(float(cost), np.sqrt(error2), error * weight, by_point, by_rest, turn)
+    return float(cost), error * weight, by_point, by_rest, turn
 
 
 def _axes_across(unit: Array) -> Array:
@@ -291,7 +265,7 @@ def _axes_across(unit: Array) -> Array:
 
 def _step(window: _Window, estimate: _Estimate, linear: _Linear, damping: float) -> tuple[_Estimate, Array]:
     """One damped Gauss-Newton step, points eliminated; also the lens' information (2,2)."""
-    error, by_point, by_rest = linear.error, linear.by_point, linear.by_rest
+    (T, xyzw, lens), (_, error, by_point, by_rest, turn) = estimate, linear
     H = np.add.reduceat(np.einsum("kin,kjn->ijn", by_point, by_point), window.first, axis=2).transpose(2, 0, 1)
     diagonal = np.einsum("nii->ni", H)
     diagonal += damping * diagonal + 1e-12 * diagonal.sum(axis=1, keepdims=True)
@@ -316,12 +290,11 @@ def _step(window: _Window, estimate: _Estimate, linear: _Linear, damping: float)
     S[np.diag_indices(len(S))] += 1e-12 * np.trace(S)
     information = S[-2:, -2:] - S[-2:, :-2] @ np.linalg.solve(S[:-2, :-2], S[:-2, -2:])
     S[-2:, -2:] += window.lens.information
-    g[-2:] += window.lens.information @ (estimate.lens - window.lens.value)
+    g[-2:] += window.lens.information @ (lens - window.lens.value)
     d = -np.linalg.solve(S, g)
-
-    xyzw = estimate.xyzw - np.einsum("ikn,in->kn", linear.turn, np.einsum("jin,jn->in", root, g_point + Z @ d))
+    xyzw = xyzw - np.einsum("ikn,in->kn", turn, np.einsum("jin,jn->in", root, g_point + Z @ d))
     R, t = lie.se3_exp(d[:-2].reshape(-1, 6))
-    T, R_old = estimate.T.copy(), estimate.T[~window.held, :3, :3]
+    T, R_old = T.copy(), T[~window.held, :3, :3]
     T[~window.held, :3, 3] += np.einsum("nij,nj->ni", R_old, t)
     T[~window.held, :3, :3] = R_old @ R
-    return _Estimate(T, xyzw / np.linalg.norm(xyzw, axis=0), estimate.lens + d[-2:]), information
+    return (T, xyzw / np.linalg.norm(xyzw, axis=0), lens + d[-2:]), information

@@ -70,6 +70,8 @@ class SE3:
         return np.asarray(x, float) @ self.R.T + self.t
 
     def __matmul__(self, other: SE3) -> SE3:
+        if not isinstance(other, SE3):
+            return NotImplemented  # a similarity's scale would be lost
         return SE3(self.R @ other.R, self.R @ other.t + self.t)
 
     def as_sim3(self) -> Sim3:

@@ -1,0 +1,220 @@
+"""Camera models against OpenCV and their own formulas; Jacobians; where a model ends."""
+
+import cv2
+import numpy as np
+import pytest
+
+from xalign_ros.core.camera import Camera
+
+K = np.array([420.0, 410.0, 315.5, 243.25])
+CAMERAS = {
+    "pinhole": Camera("radtan", K, [], 640, 480),
+    "radtan4": Camera("radtan", K, [-0.28, 0.07, 1e-3, -2e-3], 640, 480),
+    "radtan5": Camera("radtan", K, [0.12, -0.25, 1e-3, 5e-4, 0.1], 640, 480),
+    "radtan8": Camera("radtan", K, [0.9, 0.4, 1e-4, 2e-4, 0.05, 1.2, 0.5, 0.1], 640, 480),
+    "equidistant": Camera("equidistant", K, [-0.01, 0.02, -0.008, 0.001], 640, 480),
+    "fov": Camera("fov", K, [0.9], 640, 480),
+}
+every = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+FISHEYES = ("equidistant", "fov")
+
+
+def on_image(camera, n=400, seed=0):
+    """Points before the camera at 0.3 to 30 m that it sees, and their pixels."""
+    rng = np.random.default_rng(seed)
+    x = np.column_stack([rng.uniform(-1.2, 1.2, (n, 2)), np.ones(n)]) * rng.uniform(0.3, 30, (n, 1))
+    uv, valid = camera.project(x)
+    seen = valid & camera.inside(uv)
+    assert seen.sum() > n // 4
+    return x[seen], uv[seen]
+
+
+def matrix():
+    return np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("name", ["pinhole", "radtan4", "radtan5", "radtan8"])
+def test_radtan_against_opencv(name):
+    camera = CAMERAS[name]
+    x, uv = on_image(camera)
+    D = camera.D if len(camera.D) else None
+    want = cv2.projectPoints(x, np.zeros(3), np.zeros(3), matrix(), D)[0].reshape(-1, 2)
+    np.testing.assert_allclose(uv, want, atol=1e-9)
+
+
+def test_equidistant_against_opencv():
+    camera = CAMERAS["equidistant"]
+    x, uv = on_image(camera)
+    want = cv2.fisheye.projectPoints(x[:, None], np.zeros(3), np.zeros(3), matrix(), camera.D)[0].reshape(-1, 2)
+    np.testing.assert_allclose(uv, want, atol=1e-9)
+
+
+def test_fov_against_its_formula():
+    """Devernay and Faugeras: r_d = atan(2 r tan(w / 2)) / w along the undistorted direction."""
+    camera, w = CAMERAS["fov"], 0.9
+    x, uv = on_image(camera)
+    a = x[:, :2] / x[:, 2:]
+    r = np.linalg.norm(a, axis=1, keepdims=True)
+    np.testing.assert_allclose(uv, K[:2] * a * np.arctan(2 * r * np.tan(w / 2)) / w / r + K[2:], atol=1e-9)
+
+
+@every
+def test_jacobian_against_finite_differences(camera):
+    x, _ = on_image(camera, 60)
+    x = np.vstack([x, [0, 0, 2.0], [1e-7, 0, 1.0]])  # and on the axis
+    uv, valid, J = camera.project_with_jacobian(x)
+    assert valid.all() and np.array_equal(uv, camera.project(x)[0])
+    for c in range(3):
+        h = 1e-5 * np.linalg.norm(x, axis=1)
+        d = np.outer(h, np.eye(3)[c])
+        numeric = (camera.project(x + d)[0] - camera.project(x - d)[0]) / (2 * h[:, None])
+        np.testing.assert_allclose(J[:, :, c] * x[:, 2:], numeric * x[:, 2:], atol=2e-5)  # px per unit of direction
+
+
+@every
+def test_unproject_undoes_project(camera):
+    x, uv = on_image(camera)
+    rays, valid = camera.unproject(uv)
+    assert valid.all()
+    np.testing.assert_allclose(rays, x / np.linalg.norm(x, axis=1, keepdims=True), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, atol=1e-14)
+
+
+@every
+def test_project_undoes_unproject_over_the_whole_image(camera):
+    u, v = np.meshgrid(np.linspace(-0.5, 639.5, 33), np.linspace(-0.5, 479.5, 25))
+    uv = np.column_stack([u.ravel(), v.ravel()])
+    rays, valid = camera.unproject(uv)
+    assert valid.mean() > 0.9
+    back, ahead = camera.project(5 * rays[valid])
+    assert ahead.all()
+    np.testing.assert_allclose(back, uv[valid], atol=1e-9 * K[0])
+
+
+def test_unproject_against_opencv():
+    camera = CAMERAS["radtan5"]
+    _, uv = on_image(camera)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
+    want = cv2.undistortPoints(uv[:, None], matrix(), camera.D, criteria=stop).reshape(-1, 2)
+    rays, _ = camera.unproject(uv)
+    np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], want, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_the_principal_point_is_straight_ahead(name):
+    camera = CAMERAS[name]
+    rays, valid = camera.unproject(K[None, 2:])
+    assert valid[0]
+    np.testing.assert_allclose(rays[0], [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(camera.project([[0, 0, 3.0]])[0][0], K[2:])
+
+
+def test_pixel_zero_is_the_centre_of_the_first_pixel():
+    camera = Camera("radtan", [100, 100, 0, 0], [], 10, 8)
+    np.testing.assert_allclose(camera.project([[0.05, 0.03, 1]])[0], [[5, 3]])
+    uv = np.array([[-0.5, -0.5], [9.5, 7.5], [-0.6, 0], [0, 7.6], [np.nan, 0]])
+    assert camera.inside(uv).tolist() == [True, True, False, False, False]
+    assert camera.inside(uv, 1.0).tolist() == [True, True, True, True, False]
+
+
+# Where a model ends -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_behind_the_camera_is_invalid_and_nan(name):
+    camera = CAMERAS[name]
+    x = np.array([[0.1, 0.2, -2.0], [0, 0, -1.0], [0, 0, 0], [np.nan, 0, 1], [0.1, 0.2, 2.0]])
+    uv, valid, _ = camera.project_with_jacobian(x)
+    assert valid.tolist() == [False, False, False, False, True]
+    assert np.isnan(uv[:4]).all() and np.isfinite(uv[4]).all()
+
+
+@pytest.mark.parametrize("name", FISHEYES)
+def test_a_fisheye_sees_sideways_and_a_little_back(name):
+    camera = Camera(CAMERAS[name].model, [100, 100, 500, 500], [0.9] if name == "fov" else [0, 0, 0, 0], 1000, 1000)
+    angle = np.deg2rad([60, 89, 91, 120])
+    x = np.column_stack([np.sin(angle), np.zeros(4), np.cos(angle)])
+    uv, valid, J = camera.project_with_jacobian(x)
+    assert valid.all() and (np.diff(uv[:, 0]) > 0).all() and np.isfinite(J).all()
+    rays, back = camera.unproject(uv)
+    assert back.all()
+    np.testing.assert_allclose(rays, x, atol=1e-9)
+    if name == "equidistant":
+        np.testing.assert_allclose(uv[:, 0], 500 + 100 * angle)
+
+
+def test_beyond_the_fold_of_a_barrel_distortion_nothing_is_valid():
+    """r (1 - 0.4 r^2) turns back at r = sqrt(1 / 1.2) = 0.913; beyond it a point would appear inside the image again."""
+    camera = Camera("radtan", K, [-0.4, 0, 0, 0], 640, 480)
+    fold = np.sqrt(1 / 1.2)
+    assert camera.limit == pytest.approx(fold, rel=5e-3)
+    x = np.array([[fold - 0.01, 0, 1], [fold + 0.01, 0, 1], [1.5, 0, 1]])
+    uv, valid = camera.project(x)
+    assert valid.tolist() == [True, False, False]
+    top = K[2] + K[0] * fold * (1 - 0.4 * fold**2)
+    rays, found = camera.unproject([[top - 1, K[3]], [top + 1, K[3]]])
+    assert found.tolist() == [True, False] and np.isnan(rays[1]).all()
+    assert rays[0, 0] / rays[0, 2] < fold
+
+
+def test_beyond_the_fold_of_a_fisheye_nothing_is_valid():
+    """theta (1 - 0.2 theta^2) turns back at theta = sqrt(1 / 0.6) = 1.291 rad."""
+    camera = Camera("equidistant", K, [-0.2, 0, 0, 0], 640, 480)
+    fold = np.sqrt(1 / 0.6)
+    assert camera.limit == pytest.approx(fold, rel=5e-3)
+    angle = np.array([fold - 0.02, fold + 0.02])
+    x = np.column_stack([np.sin(angle), np.zeros(2), np.cos(angle)])
+    assert camera.project(x)[1].tolist() == [True, False]
+    top = K[2] + K[0] * fold * (1 - 0.2 * fold**2)
+    assert camera.unproject([[top - 1, K[3]], [top + 1, K[3]]])[1].tolist() == [True, False]
+
+
+def test_beyond_the_half_circle_of_fov_nothing_is_valid():
+    camera = CAMERAS["fov"]
+    edge = K[2] + K[0] * np.pi / 0.9
+    assert not camera.unproject([[edge + 1, K[3]]])[1][0]
+
+
+@every
+def test_no_points_are_no_error(camera):
+    uv, valid, J = camera.project_with_jacobian(np.zeros((0, 3)))
+    assert (uv.shape, valid.shape, J.shape) == ((0, 2), (0,), (0, 2, 3))
+    rays, valid = camera.unproject(np.zeros((0, 2)))
+    assert (rays.shape, valid.shape) == ((0, 3), (0,))
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_pixels_that_are_no_numbers_are_invalid():
+    for camera in CAMERAS.values():
+        rays, valid = camera.unproject([[np.nan, 3], [10, np.inf], [300, 200]])
+        assert valid.tolist() == [False, False, True] and np.isnan(rays[:2]).all()
+
+
+# Errors -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"model": "brown"}, "camera model 'brown' is not one of radtan, equidistant, fov"),
+        ({"D": [0.1, 0.2, 0.3]}, "radtan takes"),
+        ({"model": "equidistant", "D": [0.1]}, "equidistant takes"),
+        ({"model": "fov", "D": [0.1, 0.2]}, "fov takes"),
+        ({"K": [0, 410, 315, 243]}, "no usable intrinsics"),
+        ({"K": [420, -1, 315, 243]}, "no usable intrinsics"),
+        ({"K": [420, np.nan, 315, 243]}, "no usable intrinsics"),
+        ({"D": [0.1, np.inf, 0, 0]}, "no usable intrinsics"),
+        ({"K": np.eye(3)}, "Camera.K"),
+        ({"D": np.zeros((1, 4))}, "Camera.D"),
+        ({"width": 0}, "0 x 480"),
+        ({"height": -1}, "640 x -1"),
+        ({"model": "fov", "D": [0.0]}, "fov"),
+        ({"model": "fov", "D": [-0.9]}, "fov"),
+        ({"model": "fov", "D": [4.0]}, "fov"),
+    ],
+)
+def test_what_cannot_be_a_camera_is_an_error(change, words):
+    good = {"model": "radtan", "K": K, "D": [0.1, 0.01, 0, 0], "width": 640, "height": 480}
+    Camera(**good)
+    with pytest.raises(ValueError, match=words):
+        Camera(**{**good, **change})

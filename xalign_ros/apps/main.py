@@ -1,0 +1,44 @@
+"""The command line `xalign`: words on stderr, results on stdout; 0 done, 1 bad input (one sentence), 2 wrong usage."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+import xalign_ros
+from xalign_ros.core.errors import XalignError
+
+COMMANDS = {
+    "demo": "the main job on real input: map built, run replayed, report written",
+    "map": "build, inspect and check reference maps",
+    "replay": "align a log to a map, without ROS or (--live) through the running node",
+    "log": "what is in a log",
+    "node": "the live ROS 2 node",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["node"]:  # its arguments are ROS's
+        return int(importlib.import_module("xalign_ros.apps.node").main(words[1:]) or 0)
+    parser = argparse.ArgumentParser(prog="xalign", description="Put a running odometry source onto a map.")
+    parser.add_argument("--version", action="version", version=f"xalign {xalign_ros.__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, text in COMMANDS.items():
+        sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        if words[:1] == [name] and name != "node":  # the others' imports are not worth waiting for
+            importlib.import_module(f"xalign_ros.apps.{name}").add_arguments(sub)
+    args = parser.parse_args(words)
+    command = "player" if args.command == "replay" and args.live else args.command
+    try:
+        importlib.import_module(f"xalign_ros.apps.{command}").run(args)
+    except XalignError as e:
+        print(f"xalign: {e}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0

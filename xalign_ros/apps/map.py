@@ -1,0 +1,115 @@
+"""xalign map: build, info, check."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from xalign_ros.core.errors import MapError
+from xalign_ros.core.map_building import build_map
+from xalign_ros.core.map_check import check_map
+from xalign_ros.core.records import Keyframe
+from xalign_ros.core.transforms import SE3
+from xalign_ros.io.log import Log
+from xalign_ros.io.tum import pose_at, read_tum
+from xalign_ros.io.xmap import read_header, read_map, write_map
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(dest="map_command", required=True, metavar="{build,info,check}")
+    build = commands.add_parser("build", help="make a reference map", description="Make a reference map.")
+    source = build.add_mutually_exclusive_group(required=True)
+    source.add_argument("--log", type=Path, metavar="LOG", help="a posed run: its keyframes, with --poses")
+    source.add_argument("--colmap", type=Path, metavar="MODEL_DIR", help="a COLMAP model, with --database")
+    build.add_argument("--poses", type=Path, metavar="TUM_FILE", help="T_map_cam of the run's keyframes")
+    build.add_argument("--database", type=Path, metavar="DB", help="COLMAP's database with the descriptors")
+    build.add_argument("--keyframe-topic", metavar="TOPIC", help="needed where a log has several")
+    scale = build.add_mutually_exclusive_group()
+    scale.add_argument("--scale", type=float, metavar="S", help="metres per unit of a COLMAP model")
+    scale.add_argument("--align", type=Path, metavar="TUM_FILE", help="metric T_map_cam of the model's images")
+    build.add_argument("-o", "--output", type=Path, required=True, metavar="MAP", help="the .xmap folder to write")
+    build.add_argument("--force", action="store_true", help="replace an existing map")
+    for name, text in (("info", "what a map holds"), ("check", "integrity, and the recall to expect")):
+        sub = commands.add_parser(name, help=text, description=text.capitalize() + ".")
+        sub.add_argument("map", type=Path, metavar="MAP")
+        sub.add_argument("--json", action="store_true", help="print one JSON object instead of words")
+
+
+def run(args: argparse.Namespace) -> None:
+    {"build": _build, "info": _info, "check": _check}[args.map_command](args)
+
+
+def _build(args: argparse.Namespace) -> None:
+    if args.output.exists() and not args.force:
+        raise MapError(f"{args.output} exists; give another name or --force to replace it")
+    if args.log is not None:
+        if args.poses is None:
+            raise MapError("--log needs --poses with the T_map_cam of its keyframes")
+        keyframes, poses = posed_keyframes(args.log, args.poses, args.keyframe_topic)
+        source = f"log {args.log.name}, poses {args.poses.name}"
+        try:
+            map_ = build_map(keyframes, poses, map_id=args.output.stem, source=source, metric=True)
+        except ValueError as e:
+            raise MapError(f"no map can be made from {args.log} and {args.poses}: {e}") from None
+    else:
+        raise MapError("not yet")
+    version = write_map(map_, args.output, force=args.force)
+    print(f"{args.output}: {len(map_.points)} points, {len(map_.keyframe_t)} keyframes, version {version}")
+
+
+def posed_keyframes(log_path: Path, poses_path: Path, topic: str | None) -> tuple[list[Keyframe], list[SE3]]:
+    """The log's keyframes that have a pose (T_map_cam by stamp), a camera and features."""
+    trajectory = read_tum(poses_path)
+    keyframes, poses, seen = [], [], 0
+    with Log(log_path) as log:
+        for _, keyframe, _ in log.keyframes(log.keyframe_topic(topic)):
+            seen += 1
+            T_map_cam = pose_at(trajectory, keyframe.stamp_ns) if keyframe is not None else None
+            if keyframe is not None and T_map_cam is not None and keyframe.camera is not None and len(keyframe.features):
+                keyframes.append(keyframe)
+                poses.append(T_map_cam)
+    if len(keyframes) < 2:
+        raise MapError(
+            f"{len(keyframes)} of the {seen} keyframes of {log_path} have features, a camera and a pose in {poses_path}; "
+            "a map needs two: check that the stamps are of one clock"
+        )
+    print(f"{len(keyframes)} of {seen} keyframes have a pose", file=sys.stderr)
+    return keyframes, poses
+
+
+def _info(args: argparse.Namespace) -> None:
+    map_ = read_map(args.map)
+    header = read_header(args.map)
+    low, high = np.percentile(map_.points, [1, 99], axis=0)
+    info = {k: header[k] for k in ("id", "version", "frame", "metric", "source", "points", "keyframes", "features")}
+    info |= {
+        "descriptor": f"{map_.descriptor_name} {map_.norm.name} of {map_.descriptors.shape[1]}",
+        "observations": int((map_.feature_point >= 0).sum()),
+        "sigma_px": map_.sigma_px,
+        "anchor_sigma_m": map_.anchor_sigma[1],
+        "anchor_sigma_rad": map_.anchor_sigma[0],
+        "extent": [round(float(x), 2) for x in high - low],
+        "cameras": [f"{c.model} {c.width}x{c.height}" for c in map_.cameras],
+    }
+    _print(info, args.json)
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Integrity first; then held-out keyframes are localized in a map made of the others."""
+    map_ = read_map(args.map, verify=True)
+    _print({"id": map_.map_id, "version": map_.version, "integrity": "ok"} | check_map(map_), args.json)
+
+
+def _print(values: dict[str, object], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(values))
+        return
+    for key, value in values.items():
+        print(f"{key:22s} {f'{value:.4g}' if isinstance(value, float) else value}")
+
+
+
