@@ -44,7 +44,9 @@ class Case:
     missed: list[str] = field(default_factory=list)
 
     def figure(self, label: str, value: float, low: float = -np.inf, high: float = np.inf) -> None:
-        target = "" if low == -np.inf and high == np.inf else f"{low:g} .. {high:g}" if low > -np.inf else f"<= {high:g}"
+        target = (
+            "" if low == -np.inf and high == np.inf else f"{low:g} .. {high:g}" if low > -np.inf else f"<= {high:g}"
+        )
         self.rows.append((label, float(value), target))
         if not low <= value <= high:
             self.missed.append(f"{self.name}: {label} is {value:.4g}, target {target}")
@@ -158,12 +160,27 @@ def seeded(case: Case, work: Path, posed: Posed, wander: float, targets: dict[st
         run = replay(work, map_, keyframes, run_posed[1])
         e = pose_errors(run, keyframes, run_posed[1])[:, 0]
         lock = run.result["first_lock_keyframe"]
-        off = [abs(run.corrections[k.id].S_map_odom.s / s - 1) for k, s in zip(keyframes, scale, strict=True) if k.id in run.corrections]
+        off = [
+            abs(run.corrections[k.id].S_map_odom.s / s - 1)
+            for k, s in zip(keyframes, scale, strict=True)
+            if k.id in run.corrections
+        ]
         anchored = sorted(run.accepted)[20:21] or [10**9]
         ids = [k.id for k in keyframes if k.id in run.corrections]
         late = [o for o, i in zip(off, ids, strict=True) if i >= anchored[0]]
         raw = run.result["raw_ate_rmse_m"]
-        table.append((lock + 1, run.result["coverage"], np.median(e), np.percentile(e, 95), e.max(), np.median(late), raw, run.result["nees_mean"]))
+        table.append(
+            (
+                lock + 1,
+                run.result["coverage"],
+                np.median(e),
+                np.percentile(e, 95),
+                e.max(),
+                np.median(late),
+                raw,
+                run.result["nees_mean"],
+            )
+        )
     t = np.array(table)
     inf = np.inf
     case.figure("locked by keyframe (worst seed)", t[:, 0].max(), high=targets.get("lock", inf))
@@ -271,7 +288,10 @@ def synthetic_hall(points: int = 24_000, keyframes: int = 240) -> tuple[Posed, P
     for n in range(keyframes):
         a = 2 * np.pi * n / keyframes
         forward = np.array([np.cos(a), np.sin(a), 0])
-        T = SE3(np.stack([np.cross([0, 0, -1.0], forward) * -1, [0, 0, -1.0], forward], axis=1), 10 * np.array([np.cos(a), np.sin(a), 0]))
+        T = SE3(
+            np.stack([np.cross([0, 0, -1.0], forward), [0, 0, -1.0], forward], axis=1),
+            10 * np.array([np.cos(a), np.sin(a), 0]),
+        )
         uv, valid = camera.project((xyz - T.t) @ T.R)
         seen = np.flatnonzero(valid & camera.inside(uv))
         seen = seen[np.argsort(rng.random(len(seen)) - 0.5 * (seen % 2 == n // 60 % 2), kind="stable")]
@@ -285,8 +305,7 @@ def synthetic_hall(points: int = 24_000, keyframes: int = 240) -> tuple[Posed, P
 
 
 CASES: dict[str, Callable[[Case, Path], None]] = {
-    f.__name__: f
-    for f in (tango, anymal, anymal_wander, anymal_halves, hololens_sift, hololens_orb, demo, step_time)
+    f.__name__: f for f in (tango, anymal, anymal_wander, anymal_halves, hololens_sift, hololens_orb, demo, step_time)
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -74,7 +75,7 @@ def with_odometry(posed: Posed, seed: int, *, wander: float = 0.0) -> tuple[list
     rng = np.random.default_rng(seed)
     start = float(np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
     T = SE3.exp(np.r_[rng.normal(size=3), 5 * rng.normal(size=3)])
-    steps = [a.inverse() @ b for a, b in zip(poses, poses[1:], strict=False)]
+    steps = [a.inverse() @ b for a, b in itertools.pairwise(poses)]
     length = sum(float(np.linalg.norm(s.t)) for s in steps)
     moved, units_per_m = [replace(keyframes[0], T_odom_cam=T, metric_scale=False)], [start]
     travelled = 0.0

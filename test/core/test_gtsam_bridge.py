@@ -144,7 +144,7 @@ def test_the_scale_of_an_anchor_is_free():
     T = SE3(LEFT, [10, 0, 0])
     factor = anchor_factor(an_anchor(T), 0, 1.0, NO_HUBER)
     assert factor.error(values(n0=Sim3(T.R, T.t, 2.0))) < 0.005
-    assert factor.error(values(n0=Sim3(T.R, T.t + [0, 0.2, 0], 1.0))) == pytest.approx(2.0, rel=1e-6)
+    assert factor.error(values(n0=Sim3(T.R, [*T.t, 0, 0.2, 0], 1.0))) == pytest.approx(2.0, rel=1e-6)
 
 
 def test_huber_bounds_what_one_anchor_can_pull():

@@ -16,9 +16,11 @@ from xalign_ros.core.camera import Camera
 from xalign_ros.core.config import Odometry
 from xalign_ros.core.lie import so3_exp
 from xalign_ros.core.map_building import build_map
+from xalign_ros.core.odometry import METRIC_WALK
 from xalign_ros.core.records import NO_TRACK, Features, Keyframe
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3, Sim3
+import itertools
 
 CAMERA = Camera("radtan", [420.0, 420.0, 319.5, 239.5], [-0.05, 0.01, 0.0005, -0.0005], 640, 480)
 SIGMA_PX = 0.7  # of a keypoint
@@ -86,7 +88,7 @@ def coded(rng: np.random.Generator, count: int) -> np.ndarray:
     return rng.integers(0, 256, (count, 32), np.uint8)
 
 
-def flipped(codes: np.ndarray, rng: np.random.Generator, probability: float = FLIP) -> np.ndarray:
+def flipped(codes: np.ndarray, rng: np.random.Generator, probability: float) -> np.ndarray:
     bits = rng.random((len(codes), 8 * codes.shape[1])) < probability
     return codes ^ np.packbits(bits, axis=1)
 
@@ -95,7 +97,14 @@ def flipped(codes: np.ndarray, rng: np.random.Generator, probability: float = FL
 
 
 def seen_from(
-    points: np.ndarray, codes: np.ndarray, T_map_cam: SE3, rng: np.random.Generator, *, ids: int, sigma_px: float = SIGMA_PX
+    points: np.ndarray,
+    codes: np.ndarray,
+    T_map_cam: SE3,
+    rng: np.random.Generator,
+    *,
+    ids: int,
+    sigma_px: float = SIGMA_PX,
+    flip: float = FLIP,
 ) -> Features:
     """What a camera at T_map_cam sees: landmarks with noise of pixel and code, and some clutter that is none."""
     x_cam = T_map_cam.inverse().apply(points)
@@ -106,7 +115,7 @@ def seen_from(
     loose = rng.uniform(0, [CAMERA.width - 1, CAMERA.height - 1], (CLUTTER, 2))
     return Features(
         uv=np.vstack([uv, loose]),
-        descriptors=np.vstack([flipped(codes[rows], rng), coded(rng, CLUTTER)]),
+        descriptors=np.vstack([flipped(codes[rows], rng, flip), coded(rng, CLUTTER)]),
         name="code",
         sigma_px=np.full(len(rows) + CLUTTER, sigma_px),
         track_ids=np.r_[(rows + ids).astype(np.uint64), np.full(CLUTTER, NO_TRACK)],
@@ -123,11 +132,11 @@ def drifting(
     """T_odom_cam of an odometry with `noise`, that starts with S_map_odom, and S_map_i: its local scale and the truth."""
     first = S_map_odom.inverse() @ truth[0]
     T, S = [SE3(first.R, first.t)], [Sim3(truth[0].R, truth[0].t, S_map_odom.s)]
-    for a, b in zip(truth, truth[1:], strict=False):
+    for a, b in itertools.pairwise(truth):
         metres = float(np.linalg.norm(b.t - a.t))
         turn = np.hypot(noise.rotation_floor_rad, noise.rotation_rad_per_sqrt_m * np.sqrt(metres))
         shift = np.hypot(noise.translation_floor_m, noise.translation_ratio * metres) / S[-1].s
-        walk = (0.1 * noise.metric_scale_sigma if metric else noise.scale_per_sqrt_m) * np.sqrt(max(metres, 1e-4))
+        walk = (METRIC_WALK * noise.metric_scale_sigma if metric else noise.scale_per_sqrt_m) * np.sqrt(max(metres, 1e-4))
         n = rng.normal(size=7) * np.r_[[turn] * 3, [shift] * 3, walk]
         S.append(Sim3(b.R, b.t, S[-1].s * float(np.exp(n[6]))))
         Z = S[-2].inverse() @ S[-1] @ Sim3.exp(n).inverse()
@@ -184,11 +193,13 @@ def blind(keyframe: Keyframe) -> Keyframe:
     return replace(keyframe, features=Features(uv, coded(rng, 60), "code"))
 
 
-def map_of(points: np.ndarray, codes: np.ndarray, poses: Sequence[SE3], name: str, seed: int = 0) -> ReferenceMap:
+def map_of(
+    points: np.ndarray, codes: np.ndarray, poses: Sequence[SE3], name: str, seed: int = 0, flip: float = FLIP
+) -> ReferenceMap:
     """The map that build_map makes of a posed run, whose poses are true and whose pixels are not."""
     rng = np.random.default_rng([3, seed])
     keyframes = [
-        Keyframe(n, 0, n, T, CAMERA, seen_from(points, codes, T, rng, ids=0)) for n, T in enumerate(poses)
+        Keyframe(n, 0, n, T, CAMERA, seen_from(points, codes, T, rng, ids=0, flip=flip)) for n, T in enumerate(poses)
     ]
     return build_map(keyframes, poses, map_id=name, source="tiny world", metric=True)
 
@@ -223,21 +234,28 @@ def loop_with_scale_drift(seed: int = 0) -> World:
     return World("loop_with_scale_drift", once.points, once.codes, once.map, tuple(along_circle(80, 4.0, 2.0, 0.2)))
 
 
-PLACE_M = 12.0  # length of each of the corridor's five parts
+PLACE_M = 10.0  # length of each of the corridor's five parts; a sideways view spans at most 11 m of it
+LOOK_ALIKES = ((1, 3), 2 * PLACE_M)  # the parts that are the same, and how far apart
+
+
+def corridor_camera(x: float, y: float = 0.0) -> SE3:
+    return camera_at(x, y, 0.0, np.pi / 2 + 0.1)
 
 
 @functools.cache
-def look_alike_corridor(seed: int = 0, exact: bool = False) -> World:
-    """Five parts of a corridor; the second and the fourth are the same to the last descriptor."""
+def look_alike_corridor(seed: int = 0, step: float = 0.65, flip: float = FLIP) -> World:
+    """Five parts of a corridor along x, seen sideways; the second and the fourth are the same to the last descriptor."""
     rng = np.random.default_rng([4, seed])
-    part = lambda n: scattered(rng, [n * PLACE_M, -4, -2], [(n + 1) * PLACE_M, 4, 2], 400)  # noqa: E731
-    parts = [part(n) for n in range(5)]
-    parts[3] = parts[1] + [2 * PLACE_M, 0, 0]
-    points = np.vstack(parts)
-    codes = coded(rng, len(points)).reshape(5, 400, 32)
-    codes[3] = codes[1]
-    codes = codes.reshape(-1, 32)
-    poses = [camera_at(x, 0.0, 0.0, 0.4) for x in np.arange(0.5, 5 * PLACE_M - 2, 0.75)]
-    map_ = map_of(points, codes, poses, "look_alike_corridor", seed)
-    truth = [camera_at(x, 0.15, 0.1, 0.4) for x in np.arange(0.7, 5 * PLACE_M - 3, 0.75)]
+    parts = [scattered(rng, [n * PLACE_M, 1.5, -2.5], [(n + 1) * PLACE_M, 7, 2.5], 350) for n in range(5)]
+    codes = coded(rng, 5 * 350).reshape(5, 350, 32)
+    parts[3], codes[3] = parts[1] + [2 * PLACE_M, 0, 0], codes[1]
+    points, codes = np.vstack(parts), codes.reshape(-1, 32)
+    poses = [corridor_camera(x) for x in np.arange(0.5, 5 * PLACE_M - 0.5, step)]
+    map_ = map_of(points, codes, poses, "look_alike_corridor", seed, flip)
+    truth = [corridor_camera(x, 0.15) for x in np.arange(0.7, 5 * PLACE_M - 1, 0.65)]
     return World("look_alike_corridor", points, codes, map_, tuple(truth))
+
+
+def within_part(T_map_cam: SE3, part: int, margin: float = 3.5) -> bool:
+    """Whether a camera of the corridor sees hardly more than this part."""
+    return bool(part * PLACE_M + margin < T_map_cam.t[0] < (part + 1) * PLACE_M - margin)

@@ -1,10 +1,12 @@
-"""COLMAP models to read and write: a tiny one in text, whose numbers mean something, and random ones."""
+"""COLMAP models and databases: a tiny model in text, whose numbers mean something, random ones, and their damage."""
 
 from __future__ import annotations
 
 import contextlib
 import re
+import sqlite3
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -130,3 +132,23 @@ def damage_at_random(folder: Path, ending: str, seed: int) -> None:
             with contextlib.suppress(MapError):
                 read_model(folder)
         path.write_bytes(good)
+
+
+def old_database(path: Path, *, typed: bool = False) -> sqlite3.Connection:
+    """The schema of COLMAP up to 3.13, or with the column `type` of 4.0, as far as it is read."""
+    db = sqlite3.connect(path)
+    db.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT, camera_id INTEGER)")
+    db.execute("CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)")
+    kind = "type INTEGER, " if typed else ""
+    db.execute(f"CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY, {kind}rows INTEGER, cols INTEGER, data BLOB)")
+    return db
+
+
+def add_features(
+    db: sqlite3.Connection, name: str, keypoints: tuple[Any, ...] | None, descriptors: tuple[Any, ...] | None
+) -> None:
+    k = db.execute("INSERT INTO images (name, camera_id) VALUES (?, 1)", (name,)).lastrowid
+    for table, row in (("keypoints", keypoints), ("descriptors", descriptors)):
+        if row is not None:
+            db.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * (len(row) + 1))})", (k, *row))
+    db.commit()

@@ -9,30 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from colmap_samples import LFS, assert_one_sentence
+from colmap_samples import LFS, add_features, assert_one_sentence, old_database
 
 from xalign_ros.core.errors import MapError
 from xalign_ros.io.colmap_database import read_database
-
-
-def old_database(path: Path, *, typed: bool = False) -> sqlite3.Connection:
-    """The schema of COLMAP up to 3.13, or with the column `type` of 4.0, as far as it is read."""
-    db = sqlite3.connect(path)
-    db.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT, camera_id INTEGER)")
-    db.execute("CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)")
-    kind = "type INTEGER, " if typed else ""
-    db.execute(f"CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY, {kind}rows INTEGER, cols INTEGER, data BLOB)")
-    return db
-
-
-def add(
-    db: sqlite3.Connection, name: str, keypoints: tuple[Any, ...] | None, descriptors: tuple[Any, ...] | None
-) -> None:
-    k = db.execute("INSERT INTO images (name, camera_id) VALUES (?, 1)", (name,)).lastrowid
-    for table, row in (("keypoints", keypoints), ("descriptors", descriptors)):
-        if row is not None:
-            db.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * (len(row) + 1))})", (k, *row))
-    db.commit()
 
 
 @pytest.mark.parametrize("columns", [2, 4, 6])
@@ -42,9 +22,9 @@ def test_database_without_types(columns: int, tmp_path: Path) -> None:
     floats = np.random.default_rng(1).normal(size=(3, 64)).astype("<f4")
     path = tmp_path / "data base?#.db"
     db = old_database(path)
-    add(db, "sift.jpg", (3, columns, keypoints.tobytes()), (3, 128, sift.tobytes()))
-    add(db, "float.jpg", (3, columns, keypoints.tobytes()), (3, 64, floats.tobytes()))
-    add(db, "nothing.jpg", (0, columns, None), (0, 128, None))
+    add_features(db, "sift.jpg", (3, columns, keypoints.tobytes()), (3, 128, sift.tobytes()))
+    add_features(db, "float.jpg", (3, columns, keypoints.tobytes()), (3, 64, floats.tobytes()))
+    add_features(db, "nothing.jpg", (0, columns, None), (0, 128, None))
     db.close()
     found = read_database(path, ["nothing.jpg", "float.jpg", "sift.jpg"])
     assert list(found) == ["nothing.jpg", "float.jpg", "sift.jpg"]
@@ -116,7 +96,7 @@ def test_damaged_features_give_one_sentence(
     keypoints: tuple[Any, ...] | None, descriptors: tuple[Any, ...] | None, words: str, tmp_path: Path
 ) -> None:
     db = old_database(tmp_path / "d.db", typed=True)
-    add(db, "a", keypoints, descriptors)
+    add_features(db, "a", keypoints, descriptors)
     db.close()
     with pytest.raises(MapError, match=words) as error:
         read_database(tmp_path / "d.db", ["a"])
@@ -127,7 +107,7 @@ def test_damaged_databases_give_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "d.db"
     db = old_database(path)
     for k in range(200):
-        add(db, f"{k}.jpg", (1, 2, POINT), (1, 128, bytes(128)))
+        add_features(db, f"{k}.jpg", (1, 2, POINT), (1, 128, bytes(128)))
     db.close()
     good = path.read_bytes()
     (tmp_path / "other.db").touch()

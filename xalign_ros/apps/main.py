@@ -14,6 +14,7 @@ COMMANDS = {
     "demo": "the main job on real input: map built, run replayed, report written",
     "map": "build, inspect and check reference maps",
     "replay": "align a log to a map, without ROS or (--live) through the running node",
+    "batch": "smooth whole logs: every keyframe's pose from all the evidence",
     "log": "what is in a log",
     "node": "the live ROS 2 node",
 }
@@ -31,6 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if words[:1] == [name] and name != "node":  # the others' imports are not worth waiting for
             importlib.import_module(f"xalign_ros.apps.{name}").add_arguments(sub)
     args = parser.parse_args(words)
+    args.xalign = main  # the demo runs the commands that a user would
     command = "player" if args.command == "replay" and args.live else args.command
     try:
         importlib.import_module(f"xalign_ros.apps.{command}").run(args)

@@ -10,7 +10,7 @@ import numpy as np
 from xalign_ros.core.anchor import find_anywhere, find_guided
 from xalign_ros.core.config import Config
 from xalign_ros.core.consensus import Consensus, Witness, find_consensus
-from xalign_ros.core.intake import carries_pose, refusal
+from xalign_ros.core.intake import begins_session, carries_pose, refusal
 from xalign_ros.core.lie import Array
 from xalign_ros.core.odometry import edge_between, odom_in_map, pose_covariance, predict
 from xalign_ros.core.records import (
@@ -74,7 +74,7 @@ class Aligner:
             return self._step(fault)
         earlier = [link.keyframe for link in self._links]
         last = earlier[-1] if earlier else None
-        if last and (keyframe.session > last.session or (keyframe.session < last.session and keyframe.stamp_ns > last.stamp_ns)):
+        if last and begins_session(keyframe, last):
             self._begin_session(State.LOST, f"the odometry began session {keyframe.session}")
             earlier, last = [], None
         refused = refusal(keyframe, earlier, self.index.map)
@@ -89,11 +89,11 @@ class Aligner:
             if isinstance(found, Anchor):
                 self._window.attach(found)
             self._solution = self._window.solve()
-        found = self._challenge(found)
+        found, believed = self._challenge(found)
         if isinstance(found, Anchor):
             self._links[-1].accepted = True
             self._anchored = self._links[-1]
-        return self._step(found, predicted, self._correction(keyframe))
+        return self._step(found, predicted, self._correction(keyframe), believed)
 
     # -- parts of a step, in order -------------------------------------------------------------------------------
 
@@ -120,7 +120,7 @@ class Aligner:
         if isinstance(found, Rejection):
             return found
         self._links[-1].anchor = found
-        if predicted is None:
+        if predicted is None or self._judged(pose_covariance(*predicted))[0] is State.LOST:
             return _refused(found, "inconsistent", "it waits for others that agree with it")
         S, cov = predicted
         error = (found.T_map_cam.inverse() @ S.rigid_pose()).log()
@@ -128,21 +128,24 @@ class Aligner:
         if chi2 < self.config.lock.chi2:
             return found
         off = float(np.linalg.norm(error[3:]))
-        return _refused(found, "drift_budget", f"it is {off:.2f} m off the prediction: {chi2:.0f} > {self.config.lock.chi2:g}")
+        return _refused(
+            found, "drift_budget", f"it is {off:.2f} m off the prediction: {chi2:.0f} > {self.config.lock.chi2:g}"
+        )
 
-    def _challenge(self, found: Anchor | Rejection) -> Anchor | Rejection:
-        """Lock, or lock anew, when the anchors not believed so far agree and outnumber those that were."""
+    def _challenge(self, found: Anchor | Rejection) -> tuple[Anchor | Rejection, tuple[Anchor, ...]]:
+        """Lock, or lock anew, when the anchors not believed so far agree and outnumber those that were.
+
+        Returns the newest evidence as it stands now, and the earlier anchors that are believed with it.
+        """
         if isinstance(found, Anchor) or found.anchor is None or found.anchor is not self._links[-1].anchor:
-            return found
+            return found, ()
         waiting = [link for link in self._links if link.anchor is not None and not link.accepted]
         witnesses = [Witness(link.anchor, link.keyframe.T_odom_cam, link.path) for link in waiting if link.anchor]
         consensus = find_consensus(witnesses, waiting[-1].keyframe.metric_scale, self.config)
-        if consensus is None:
-            return found
-        members = [waiting[n] for n in consensus.members]
-        if len(members) <= self._incumbents(members[0]) or not self._lock(consensus, members):
-            return found
-        return found.anchor
+        members = [waiting[n] for n in consensus.members] if consensus else []
+        if consensus is None or len(members) <= self._incumbents(members[0]) or not self._lock(consensus, members):
+            return found, ()
+        return found.anchor, tuple(link.anchor for link in members[:-1] if link.anchor)
 
     def _incumbents(self, challenger: _Link) -> int:
         """Accepted anchors that speak against a challenge: those since it began, and at most incumbent_cap before."""
@@ -199,7 +202,11 @@ class Aligner:
         return Correction(*who, S_map_odom, cov, T_map_cam, self._pose_cov())
 
     def _step(
-        self, found: Anchor | Rejection, predicted: Prediction | None = None, correction: Correction | None = None
+        self,
+        found: Anchor | Rejection,
+        predicted: Prediction | None = None,
+        correction: Correction | None = None,
+        believed: tuple[Anchor, ...] = (),
     ) -> Step:
         rejection = found if isinstance(found, Rejection) else None
         self._counts["accepted"] += rejection is None
@@ -213,8 +220,11 @@ class Aligner:
             correction,
             found if isinstance(found, Anchor) else None,
             rejection,
+            believed,
             predicted[0].rigid_pose() if predicted else None,
-            tuple((k, S.rigid_pose()) for k, S in zip(solution.keys, solution.S_map_i, strict=True)) if solution else (),
+            tuple((k, S.rigid_pose()) for k, S in zip(solution.keys, solution.S_map_i, strict=True))
+            if solution
+            else (),
         )
 
     def _state(self, session: int, stamp_ns: int) -> AlignmentState:

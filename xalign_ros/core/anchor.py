@@ -8,7 +8,7 @@ import numpy as np
 
 from xalign_ros.core.config import Config
 from xalign_ros.core.lie import Array
-from xalign_ros.core.matching import Matches, guided_matches, place_matches, places
+from xalign_ros.core.matching import NO_MATCHES, Matches, guided_matches, place_matches, places
 from xalign_ros.core.pnp import Points2D3D, Pose, estimate_pose
 from xalign_ros.core.records import Anchor, Keyframe, Rejection
 from xalign_ros.core.reference_map import MapIndex
@@ -29,7 +29,9 @@ def seed_of(keyframe: Keyframe) -> int:
     return int.from_bytes(digest[:4], "little") & 0x7FFFFFFF
 
 
-def find_guided(keyframe: Keyframe, index: MapIndex, T_map_cam: SE3, cov_cam: Array, config: Config) -> Anchor | Rejection:
+def find_guided(
+    keyframe: Keyframe, index: MapIndex, T_map_cam: SE3, cov_cam: Array, config: Config
+) -> Anchor | Rejection:
     """Anchor from matches around a predicted pose with covariance (6, 6), camera axes."""
     camera = _camera(keyframe)
     sigma_px = float(np.median(_sigma_px(keyframe, index, config)))
@@ -40,14 +42,13 @@ def find_guided(keyframe: Keyframe, index: MapIndex, T_map_cam: SE3, cov_cam: Ar
 
 def find_anywhere(keyframe: Keyframe, index: MapIndex, config: Config) -> Anchor | Rejection:
     """Anchor from the whole map: places by vote, matches and pose in each, the second best place as a warning."""
-    empty = Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
     tried: list[tuple[Matches, Pose | str]] = []
     for place in places(keyframe.features, index, config.matching):
         matches = place_matches(keyframe.features, index, place, config.matching)
         tried.append((matches, _pose(keyframe, index, matches, config)))
     poses = sorted((t for t in tried if isinstance(t[1], Pose)), key=lambda t: -_inliers(t[1]))
     if not poses:
-        most = max(tried, key=lambda t: len(t[0]), default=(empty, "too_few_matches"))
+        most = max(tried, key=lambda t: len(t[0]), default=(NO_MATCHES, "too_few_matches"))
         return _result(keyframe, index, *most, 0.0, config)
     matches, best = poses[0]
     assert isinstance(best, Pose)

@@ -17,6 +17,7 @@ from xalign_ros.core.lie import Array
 from xalign_ros.core.transforms import frozen
 
 MODELS = {"radtan": (0, 4, 5, 8), "equidistant": (4,), "fov": (1,)}
+NO_JACOBIAN = np.zeros((0, 2, 3))
 MAX_ANGLE_RAD = np.deg2rad(170.0)  # of a fisheye ray from the axis; nothing real sees further
 
 
@@ -64,7 +65,7 @@ class Camera:
     def project(self, xyz_cam: ArrayLike) -> tuple[Array, np.ndarray]:
         """Pixels (N, 2) and validity (N,) of points (N, 3) of the camera frame; invalid rows are NaN."""
         x = np.asarray(xyz_cam, float)
-        m, valid = self._distort(x)[:2]
+        m, valid, _ = self._distort(x, False)
         uv = self.K[:2] * m + self.K[2:]
         uv[~valid] = np.nan
         return uv, valid
@@ -72,7 +73,7 @@ class Camera:
     def project_with_jacobian(self, xyz_cam: ArrayLike) -> tuple[Array, np.ndarray, Array]:
         """Pixels (N, 2), validity (N,) and d uv / d xyz_cam (N, 2, 3)."""
         x = np.asarray(xyz_cam, float)
-        m, valid, J = self._distort(x)
+        m, valid, J = self._distort(x, True)
         uv = self.K[:2] * m + self.K[2:]
         uv[~valid] = np.nan
         return uv, valid, self.K[:2, None] * J
@@ -100,19 +101,20 @@ class Camera:
         rays[~valid] = np.nan
         return rays, valid
 
-    def _distort(self, x: Array) -> tuple[Array, np.ndarray, Array]:
-        """Distorted normalised points (N, 2), validity (N,), Jacobian to the camera point (N, 2, 3)."""
+    def _distort(self, x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:
+        """Distorted normalised points (N, 2), validity (N,), Jacobian to the camera point (N, 2, 3) if asked for."""
+        distort = _distort_radtan if self.model == "radtan" else _distort_radial
         with np.errstate(invalid="ignore", divide="ignore"):
-            return _distort_radtan(self, x) if self.model == "radtan" else _distort_radial(self, x)
+            return distort(self, x, jacobian)
 
     def _undistort_radtan(self, m: Array) -> tuple[Array, np.ndarray]:
         if not self.D.any():
-            return m.copy(), np.isfinite(m).all(axis=1)
+            return m.copy(), np.asarray(np.isfinite(m).all(axis=1))
         d = _eight(self.D)
         a = m.copy()
         with np.errstate(all="ignore"):
             for _ in range(20):  # Newton on a 2 x 2 system; converges in 3-6 inside the monotonic region
-                f, J = _radtan(d, a)
+                f, J = _radtan(d, a, True)
                 r = f - m
                 det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
                 step = np.stack(
@@ -121,8 +123,9 @@ class Camera:
                 a -= step / det[:, None]
                 if not (np.abs(r) > 1e-13).any():
                     break
-            valid = (np.abs(_radtan(d, a)[0] - m).max(axis=1) < 1e-9) & (np.linalg.norm(a, axis=1) <= self.limit)
-        return a, valid
+            valid = np.abs(_radtan(d, a, False)[0] - m).max(axis=1) < 1e-9
+            valid &= np.linalg.norm(a, axis=1) <= self.limit
+        return a, np.asarray(valid)
 
     def _angle(self, r_d: Array) -> tuple[Array, np.ndarray]:
         """Angle from the optical axis (N,) rad of distorted radii (N,), for the fisheye models."""
@@ -157,13 +160,15 @@ def _radial(d: Array, r2: Array) -> tuple[Array, Array]:
     return top / low, (dtop * low - top * dlow) / low**2
 
 
-def _radtan(d: Array, a: Array) -> tuple[Array, Array]:
-    """Distorted points (N, 2) and Jacobian (N, 2, 2) of normalised points (N, 2)."""
+def _radtan(d: Array, a: Array, jacobian: bool) -> tuple[Array, Array]:
+    """Distorted points (N, 2) and, if asked for, Jacobian (N, 2, 2) of normalised points (N, 2)."""
     x, y = a[:, 0], a[:, 1]
     p1, p2 = d[2], d[3]
     r2 = x * x + y * y
     g, dg = _radial(d, r2)
     f = np.stack([x * g + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * g + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], 1)
+    if not jacobian:
+        return f, NO_JACOBIAN
     J = np.empty((len(a), 2, 2))
     J[:, 0, 0] = g + 2 * x * x * dg + 2 * p1 * y + 6 * p2 * x
     J[:, 0, 1] = J[:, 1, 0] = 2 * x * y * dg + 2 * p1 * x + 2 * p2 * y
@@ -171,18 +176,20 @@ def _radtan(d: Array, a: Array) -> tuple[Array, Array]:
     return f, J
 
 
-def _distort_radtan(camera: Camera, x: Array) -> tuple[Array, np.ndarray, Array]:
+def _distort_radtan(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:
     z = x[:, 2]
     a = x[:, :2] / z[:, None]
     valid = (z > 1e-9) & (np.einsum("ij,ij->i", a, a) <= camera.limit**2)
-    m, Ja = _radtan(_eight(camera.D), a)
+    m, Ja = _radtan(_eight(camera.D), a, jacobian)
+    if not jacobian:
+        return m, valid, NO_JACOBIAN
     da = np.zeros((len(x), 2, 3))
     da[:, 0, 0] = da[:, 1, 1] = 1 / z
     da[:, :, 2] = -a / z[:, None]
     return m, valid, Ja @ da
 
 
-def _distort_radial(camera: Camera, x: Array) -> tuple[Array, np.ndarray, Array]:
+def _distort_radial(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:
     """Equidistant and FOV: m = (x, y) q / r with q a function of the angle between ray and axis."""
     r, z = np.hypot(x[:, 0], x[:, 1]), x[:, 2]
     angle = np.arctan2(r, z)
@@ -201,8 +208,11 @@ def _distort_radial(camera: Camera, x: Array) -> tuple[Array, np.ndarray, Array]
     on_axis = r < 1e-9 * np.abs(z)
     safe = np.where(on_axis, 1.0, r)
     k = np.where(on_axis, dq_dr, q / safe)
+    m, valid = x[:, :2] * k[:, None], (angle <= camera.limit) & (n2 > 1e-18)
+    if not jacobian:
+        return m, valid, NO_JACOBIAN
     e = np.where(on_axis[:, None], 0.0, x[:, :2] / safe[:, None])
     J = np.empty((len(x), 2, 3))
     J[:, :, :2] = k[:, None, None] * np.eye(2) + ((dq_dr - k)[:, None] * e)[:, :, None] * e[:, None, :]
     J[:, :, 2] = dq_dz[:, None] * e
-    return x[:, :2] * k[:, None], (angle <= camera.limit) & (n2 > 1e-18), J
+    return m, valid, J

@@ -25,7 +25,7 @@ class Odometry:
     translation_ratio: float = option(0.015, "1", "translation noise of an edge per distance of that edge", 1e-5, 1.0)
     translation_floor_m: float = option(0.001, "m", "translation noise of an edge, even when standing still", 1e-6, 1.0)
     scale_per_sqrt_m: float = option(0.02, "1/sqrt(m)", "log-scale random walk where scale is not metric", 1e-6, 1.0)
-    metric_scale_sigma: float = option(0.01, "1", "log-scale prior of an odometry that says it is metric", 1e-5, 1.0)
+    metric_scale_sigma: float = option(0.02, "1", "log-scale prior of an odometry that says it is metric", 1e-5, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +46,19 @@ class Matching:
 class Pnp:
     """Absolute pose from 2D-3D matches."""
 
-    min_inliers: int = option(30, "1", "fewest inliers of an anchor; chance gives up to 8, a glimpse of the map too few to be true", 6, 10000)
+    min_inliers: int = option(
+        30, "1", "fewest inliers of an anchor; chance gives up to 8, a glimpse of the map too few to be true", 6, 10000
+    )
     sigma_px: float = option(1.0, "px", "keypoint noise where the features do not give their own", 0.05, 20.0)
     threshold_sigmas: float = option(4.0, "1", "inlier threshold in standard deviations of a match", 1.0, 20.0)
     iterations: int = option(1000, "1", "RANSAC iterations at most", 10, 1000000)
-    max_rms_sigmas: float = option(2.5, "1", "root mean square of the inliers, in standard deviations, at most", 0.5, 20.0)
+    max_rms_sigmas: float = option(
+        2.5, "1", "root mean square of the inliers, in standard deviations, at most", 0.5, 20.0
+    )
     max_sigma_ratio: float = option(0.1, "1", "position sigma over median depth, beyond it degenerate", 0.001, 1.0)
-    max_runner_up: float = option(0.75, "1", "inliers of the second best place over those of the best, at most", 0.0, 1.0)
+    max_runner_up: float = option(
+        0.75, "1", "inliers of the second best place over those of the best, at most", 0.0, 1.0
+    )
     inflation: float = option(1.2, "1", "factor on the anchor covariance for what its model leaves out", 1.0, 100.0)
 
 
@@ -130,7 +136,7 @@ def _converted(value: Any, old: Value, leaf: Field[Any], where: str) -> Value:
         new = kind(value)
         if kind is int and float(value) != new:
             raise ValueError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ConfigError(f"{where} must be {kind.__name__}, not '{value}'") from None
     low, high = leaf.metadata["low"], leaf.metadata["high"]
     if not low <= new <= high:

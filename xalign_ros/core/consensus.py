@@ -100,7 +100,10 @@ def _fit(S: Sim3, witnesses: Sequence[Witness], metric: bool) -> Sim3:
     weight = np.array([1 / np.trace(w.anchor.cov_cam[3:, 3:]) for w in witnesses])
     weight /= weight.sum()
     R = project_rotation(
-        sum((k * w.anchor.T_map_cam.R @ w.T_odom_cam.R.T for k, w in zip(weight, witnesses, strict=True)), np.zeros((3, 3)))
+        sum(
+            (k * w.anchor.T_map_cam.R @ w.T_odom_cam.R.T for k, w in zip(weight, witnesses, strict=True)),
+            np.zeros((3, 3)),
+        )
     )
     x: Array = np.array([w.T_odom_cam.t for w in witnesses])
     y: Array = np.array([w.anchor.T_map_cam.t for w in witnesses])

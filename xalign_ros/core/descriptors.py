@@ -12,7 +12,7 @@ from xalign_ros.core.records import Norm
 def pair_distance(a: np.ndarray, b: np.ndarray, norm: Norm) -> Array:
     """Distances (N,) of rows of a (N, B) to the same rows of b (N, B): bits, L2, or 1 - cosine."""
     if norm is Norm.HAMMING:
-        return np.bitwise_count(_words(a) ^ _words(b)).sum(axis=1, dtype=np.int64).astype(float)
+        return np.asarray(np.bitwise_count(_words(a) ^ _words(b)).sum(axis=1, dtype=np.int64), float)
     x, y = a.astype(np.float32), b.astype(np.float32)
     if norm is Norm.COSINE_FLOAT32:
         scale = np.linalg.norm(x, axis=1) * np.linalg.norm(y, axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -82,7 +83,7 @@ def summarize(steps: Sequence[Step], step_s: Sequence[float], digest: str) -> di
         "first_lock_s": None if first is None else (steps[first].stamp_ns - steps[0].stamp_ns) / 1e9,
         "first_lock_keyframe": first,
         "coverage": 0.0 if first is None else len(corrected) / (len(steps) - first),
-        "jumps": sum(jumped(a, b) for a, b in zip(corrections, corrections[1:], strict=False)),
+        "jumps": sum(jumped(a, b) for a, b in itertools.pairwise(corrections)),
         "scale": last.S_map_odom.s if last and last.S_map_odom else None,
         "scale_sigma": last.scale_sigma if last and last.S_map_odom else None,
         "state_seconds": _state_seconds(steps),
@@ -122,6 +123,6 @@ def _rms(values: Array) -> float | None:
 def _state_seconds(steps: Sequence[Step]) -> dict[str, float]:
     """Seconds spent in each state; a step's state holds until the next step."""
     seconds = {state.name: 0.0 for state in State}
-    for a, b in zip(steps, steps[1:], strict=False):
+    for a, b in itertools.pairwise(steps):
         seconds[a.state.state.name] += max(b.stamp_ns - a.stamp_ns, 0) / 1e9
     return seconds

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from xalign_ros.core.records import FEATURE_REASONS, Keyframe, Rejection
+from xalign_ros.core.records import FEATURE_REASONS, INPUT_REASONS, Keyframe, Rejection
 from xalign_ros.core.reference_map import ReferenceMap
+from xalign_ros.core.transforms import SE3
 
 BORDER_PX = 1.0  # a detector's sub-pixel refinement may step over the edge
 ROTATION_TOLERANCE = 1e-6
@@ -25,15 +26,16 @@ def refusal(keyframe: Keyframe, earlier: Sequence[Keyframe], map_: ReferenceMap)
 
 
 def _fault(k: Keyframe, earlier: Sequence[Keyframe], map_: ReferenceMap) -> tuple[str, str]:
-    T, f = k.T_odom_cam, k.features
-    if not (np.isfinite(T.R).all() and np.isfinite(T.t).all()):
-        return "bad_pose", "the odometry pose is not finite"
-    if np.abs(T.R @ T.R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(T.R) < 0:
-        return "bad_pose", "the odometry pose is not a rotation and a translation"
+    f = k.features
+    if fault := _pose_fault(k.T_odom_cam):
+        return "bad_pose", fault
     if any(k.id == e.id for e in earlier):
         return "duplicate_id", f"keyframe {k.id} of session {k.session} was received before"
     if earlier and k.stamp_ns <= earlier[-1].stamp_ns:
-        return "stamp_backwards", f"its stamp is {(earlier[-1].stamp_ns - k.stamp_ns) / 1e9:.3f} s behind the last one's"
+        return (
+            "stamp_backwards",
+            f"its stamp is {(earlier[-1].stamp_ns - k.stamp_ns) / 1e9:.3f} s behind the last one's",
+        )
     if earlier and k.id < earlier[-1].id:
         return "duplicate_id", f"id {k.id} follows id {earlier[-1].id}; within a session ids must rise"
     if k.camera is None:
@@ -46,12 +48,35 @@ def _fault(k: Keyframe, earlier: Sequence[Keyframe], map_: ReferenceMap) -> tupl
     width = map_.descriptors.shape[1]
     if (f.name, f.norm, f.descriptors.shape[1]) != (map_.descriptor_name, map_.norm, width):
         have = f"'{f.name}' {f.norm.name} of {f.descriptors.shape[1]}"
-        return "bad_descriptor", f"its descriptors are {have}, the map's '{map_.descriptor_name}' {map_.norm.name} of {width}"
+        return (
+            "bad_descriptor",
+            f"its descriptors are {have}, the map's '{map_.descriptor_name}' {map_.norm.name} of {width}",
+        )
     if f.norm.dtype is np.float32 and not np.isfinite(f.descriptors).all():
         return "bad_descriptor", "a descriptor is not finite"
     return "", ""
 
 
+def _pose_fault(T: SE3) -> str:
+    if not (np.isfinite(T.R).all() and np.isfinite(T.t).all()):
+        return "the odometry pose is not finite"
+    if np.abs(T.R @ T.R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(T.R) < 0:
+        return "the odometry pose is not a rotation and a translation"
+    return ""
+
+
+def begins_session(keyframe: Keyframe, last: Keyframe) -> bool:
+    """Whether the odometry began anew after `last`; a keyframe that is refused for its pose begins nothing."""
+    if keyframe.session == last.session or _pose_fault(keyframe.T_odom_cam):
+        return False
+    return keyframe.session > last.session or keyframe.stamp_ns > last.stamp_ns
+
+
 def carries_pose(rejection: Rejection) -> bool:
     """Whether the keyframe's odometry pose is used all the same."""
     return rejection.reason in FEATURE_REASONS
+
+
+def in_chain(rejection: Rejection) -> bool:
+    """Whether the keyframe became part of the odometry chain although it gave no accepted anchor."""
+    return rejection.reason not in INPUT_REASONS or carries_pose(rejection)

@@ -43,7 +43,9 @@ def check_map(map_: ReferenceMap, config: Config | None = None) -> dict[str, flo
             if isinstance(found, Anchor):
                 d = (found.T_map_cam.inverse() @ map_.keyframe_pose(int(k))).log()
                 gap = float(np.linalg.norm(found.T_map_cam.t - map_.keyframe_t[k]))
-                rows.append((gap, np.rad2deg(np.linalg.norm(d[:3])), d @ np.linalg.solve(found.cov_cam, d), found.inliers))
+                rows.append(
+                    (gap, np.rad2deg(np.linalg.norm(d[:3])), d @ np.linalg.solve(found.cov_cam, d), found.inliers)
+                )
     table = np.array(rows).reshape(-1, 4)
     middle = [float(x) for x in np.median(table, axis=0)] if len(table) else [None] * 4
     return {

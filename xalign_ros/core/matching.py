@@ -29,8 +29,17 @@ class Matches:
         return len(self.feature)
 
 
+NO_MATCHES = Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
 def guided_matches(
-    features: Features, camera: Camera, index: MapIndex, T_map_cam: SE3, cov_cam: Array, sigma_px: float, config: Matching
+    features: Features,
+    camera: Camera,
+    index: MapIndex,
+    T_map_cam: SE3,
+    cov_cam: Array,
+    sigma_px: float,
+    config: Matching,
 ) -> Matches:
     """Matches inside the ellipse that the predicted pose's covariance (6, 6), camera axes, puts around each map point.
 
@@ -39,20 +48,22 @@ def guided_matches(
     map_ = index.map
     points = index.points_of(index.keyframes_near(T_map_cam, config.guided_keyframes))
     x_cam = (map_.points[points] - T_map_cam.t) @ T_map_cam.R
-    uv, valid, J = camera.project_with_jacobian(x_cam)
+    uv, valid = camera.project(x_cam)
     seen = np.flatnonzero(valid & camera.inside(uv, config.guided_radius_px))
     if not len(seen):
-        return Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
-    points, uv, x_cam = points[seen], uv[seen], x_cam[seen]
-    J_pose = np.concatenate([J[seen] @ hat(x_cam), -J[seen]], axis=2)
-    spread = np.einsum("nij,jk,nik->n", J_pose, cov_cam, J_pose)  # trace >= larger eigenvalue
+        return NO_MATCHES
+    points, x_cam = points[seen], x_cam[seen]
+    uv, _, J = camera.project_with_jacobian(x_cam)
+    J_pose = np.concatenate([J @ hat(x_cam), -J], axis=2)
+    spread = ((J_pose @ cov_cam) * J_pose).sum(axis=(1, 2))  # the trace, which is over the larger eigenvalue
     radius = np.clip(
-        3 * np.sqrt(spread + 2 * sigma_px**2), config.guided_radius_px, max(config.guided_radius_max_px, camera.width / 10)
+        3 * np.sqrt(spread + 2 * sigma_px**2),
+        config.guided_radius_px,
+        max(config.guided_radius_max_px, camera.width / 10),
     )
-    near = cKDTree(features.uv).query_ball_point(uv, radius, return_sorted=True)
-    sizes = np.array([len(n) for n in near])
-    row = np.repeat(np.arange(len(near)), sizes)
-    column = np.concatenate([np.asarray(n, np.int64) for n in near]) if sizes.sum() else np.zeros(0, np.int64)
+    pairs = cKDTree(uv).sparse_distance_matrix(cKDTree(features.uv), float(radius.max()), output_type="ndarray")
+    pairs = pairs[pairs["v"] <= radius[pairs["i"]]]
+    row, column = pairs["i"], pairs["j"]
     distance = pair_distance(features.descriptors[column], map_.descriptors[points[row]], map_.norm)
     return _one_to_one(
         column, points[row], distance, config.guided_ratio, map_.points, T_map_cam.t, map_.descriptor_gate
@@ -64,7 +75,7 @@ def place_matches(features: Features, index: MapIndex, keyframes: np.ndarray, co
     map_ = index.map
     points = index.points_of(keyframes)
     if len(points) < 2:
-        return Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        return NO_MATCHES
     found, distance = nearest(features.descriptors, map_.descriptors[points], map_.norm, 4)
     feature = np.repeat(np.arange(len(features)), found.shape[1])
     point, distance = points[found.ravel()], distance.ravel()
@@ -75,21 +86,23 @@ def place_matches(features: Features, index: MapIndex, keyframes: np.ndarray, co
 def places(features: Features, index: MapIndex, config: Matching) -> list[np.ndarray]:
     """Places of the whole map that this keyframe looks like, best first, each an array of covisible map keyframes.
 
-    Every feature (at most cold_features of them, evenly chosen) votes through its nearest map point for the keyframes
-    that see it; a chosen place's keyframes are taken out before the next is looked for.
+    Every feature (at most cold_features of them, evenly chosen) votes through its two nearest map points, since one of
+    two look-alikes may be nearest to all of them, for the keyframes that see them. What a chosen place's keyframes see is
+    taken out before the next is looked for, so that the next is not the same place from a step further.
     """
     map_ = index.map
     chosen = np.unique(np.linspace(0, len(features) - 1, min(len(features), config.cold_features)).astype(int))
-    found, distance = nearest(features.descriptors[chosen], map_.descriptors, map_.norm, 1)
-    votes = index.votes(found[distance[:, 0] <= map_.descriptor_gate, 0])
+    found, distance = nearest(features.descriptors[chosen], map_.descriptors, map_.norm, 2)
+    points = found[distance <= map_.descriptor_gate]
     result = []
     for _ in range(config.cold_places):
+        votes = index.votes(points)
         best = int(votes.argmax())
         if votes[best] <= 0:
             break
         place = index.covisible(best, config.place_keyframes)
         result.append(place)
-        votes[place] = 0
+        points = points[~np.isin(points, index.points_of(place))]
     return result
 
 
@@ -97,17 +110,18 @@ def _one_to_one(
     feature: np.ndarray, point: np.ndarray, distance: Array, ratio: float, xyz: Array, eye: Array, gate: float
 ) -> Matches:
     """Mutual best pairs whose distance is below `ratio` times that of the feature's best pair with a different point."""
-    empty = Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
     if not len(feature):
-        return empty
+        return NO_MATCHES
     order = np.lexsort((point, distance, feature))
     f, p, d = feature[order], point[order], distance[order]
     first = np.flatnonzero(np.r_[True, np.diff(f) > 0])
     sizes = np.diff(np.r_[first, len(f)])
     best = np.repeat(first, sizes)
-    apart = np.linalg.norm(xyz[p] - xyz[p[best]], axis=1) > SAME_POINT_RATIO * np.linalg.norm(xyz[p[best]] - eye, axis=1)
+    apart = np.linalg.norm(xyz[p] - xyz[p[best]], axis=1) > SAME_POINT_RATIO * np.linalg.norm(
+        xyz[p[best]] - eye, axis=1
+    )
     runner_up = np.minimum.reduceat(np.where(apart, d, np.inf), first)
-    keep = first[(d[first] <= ratio * runner_up) & (d[first] <= gate)]
+    keep = first[(d[first] < ratio * runner_up) & (d[first] <= gate)]  # a tie at distance 0 is a tie
     # One to one from the other side: of the features that chose a point, the nearest keeps it.
     order = np.lexsort((f[keep], d[keep], p[keep]))
     keep = keep[order]

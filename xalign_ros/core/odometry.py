@@ -16,7 +16,8 @@ def edge_between(i: Keyframe, j: Keyframe, scale: float, config: Odometry) -> Re
     """The odometry edge between two keyframes; `scale` in metres per odometry unit turns the model's metres around.
 
     A random walk over the distance (rotation, log-scale), a part of the distance (translation), and floors; raised to
-    the growth of the source's own marginal covariance where it gives one.
+    the growth of the source's own marginal covariance where it gives one: what it has at j beyond that of i carried over,
+    since an old error of heading swings the far end of the path without being noise of this edge.
     """
     T_i_j = i.T_odom_cam.inverse() @ j.T_odom_cam
     distance = float(np.linalg.norm(T_i_j.t))
@@ -26,7 +27,8 @@ def edge_between(i: Keyframe, j: Keyframe, scale: float, config: Odometry) -> Re
     walk = METRIC_WALK * config.metric_scale_sigma if j.metric_scale else config.scale_per_sqrt_m
     variance = np.r_[np.full(3, rotation), np.full(3, translation), walk**2 * max(metres, 1e-4)]
     if i.cov_cam is not None and j.cov_cam is not None:
-        variance[:6] = np.maximum(variance[:6], np.diag(j.cov_cam) - np.diag(i.cov_cam))
+        Ad = T_i_j.inverse().as_sim3().adjoint()[:6, :6]
+        variance[:6] = np.maximum(variance[:6], np.diag(j.cov_cam - Ad @ i.cov_cam @ Ad.T))
     return RelativePose(i.id, j.id, T_i_j, np.sqrt(variance))
 
 

@@ -19,6 +19,7 @@ from xalign_ros.core.transforms import SE3
 MAX_RAY_RAD = np.deg2rad(80.0)  # of a virtual pinhole
 SWEEPS = 6  # at most, of each: Cauchy weights over all matches, then the inliers alone
 CAUCHY = 2.0  # standard deviations
+CONVERGED = 0.01  # length of a step in standard deviations of the pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,18 +79,20 @@ def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> P
     """
     gate = config.threshold_sigmas
     for robust in (True, False):
+        W = _whitening(T_map_cam, m, camera)
         for _ in range(SWEEPS):
-            r, J, size, _ = _whitened(T_map_cam, m, camera)
+            r, J, size, _ = _residuals(T_map_cam, m, camera, W)
             if (size < gate).sum() < config.min_inliers:
                 return "too_few_inliers"
             weight = 1 / (1 + (size / CAUCHY) ** 2) if robust else np.where(size < gate, 1.0, 0.0)
             Jw = J * weight[:, None, None]
             H = np.tensordot(Jw, J, ((0, 1), (0, 1)))
-            step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -np.tensordot(Jw, r, ((0, 1), (0, 1))))
+            g = np.tensordot(Jw, r, ((0, 1), (0, 1)))
+            step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -g)
             T_map_cam = T_map_cam @ SE3.exp(step)
-            if np.abs(step).max() < (1e-4 if robust else 1e-6):
+            if -step @ g < CONVERGED**2:
                 break
-    r, J, size, error_px = _whitened(T_map_cam, m, camera)
+    r, J, size, error_px = _residuals(T_map_cam, m, camera, W)
     inlier = size < gate
     if inlier.sum() < config.min_inliers:
         return "too_few_inliers"
@@ -110,22 +113,26 @@ def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> P
     return Pose(T_map_cam, (cov + cov.T) / 2, inlier, float(np.sqrt((error_px[inlier] ** 2).mean())), rms_sigmas)
 
 
-def _whitened(T: SE3, m: Points2D3D, camera: Camera) -> tuple[Array, Array, Array, Array]:
-    """Residual (N, 2) and Jacobian (N, 2, 6) in sigmas, Mahalanobis length (N,), pixel error (N,); invalid = infinite."""
-    x_cam = (m.xyz - T.t) @ T.R
-    uv, valid, J_cam = camera.project_with_jacobian(x_cam)
-    valid &= np.isfinite(J_cam).all(axis=(1, 2))
-    J_cam = np.where(valid[:, None, None], J_cam, 0.0)
-    error = np.where(valid[:, None], uv - m.uv, 0.0)
-    J_map = J_cam @ T.R.T
-    S = np.einsum("nij,njk,nlk->nil", J_map, m.cov, J_map) + (m.sigma_px**2)[:, None, None] * np.eye(2)
-    # Inverse Cholesky factor of each 2 x 2 by hand: L^-1 with S = L L^T.
+def _whitening(T: SE3, m: Points2D3D, camera: Camera) -> Array:
+    """L^-1 (N, 2, 2) of each residual's covariance L L^T, a 2 x 2 Cholesky factor inverted by hand."""
+    _, valid, J_cam = camera.project_with_jacobian((m.xyz - T.t) @ T.R)
+    J_map = np.where(valid[:, None, None], J_cam, 0.0) @ T.R.T
+    S = (J_map @ m.cov) @ np.swapaxes(J_map, 1, 2) + (m.sigma_px**2)[:, None, None] * np.eye(2)
     a = np.sqrt(S[:, 0, 0])
     b = S[:, 0, 1] / a
     c = np.sqrt(np.maximum(S[:, 1, 1] - b * b, 1e-12))
     W = np.zeros_like(S)
     W[:, 0, 0], W[:, 1, 0], W[:, 1, 1] = 1 / a, -b / (a * c), 1 / c
-    J = W @ J_cam @ np.concatenate([hat(x_cam), -np.broadcast_to(np.eye(3), (len(x_cam), 3, 3))], axis=2)
-    r = np.einsum("nij,nj->ni", W, error)
-    size = np.where(valid, np.linalg.norm(r, axis=1), np.inf)
-    return r, J, size, np.where(valid, np.linalg.norm(error, axis=1), np.inf)
+    return W
+
+
+def _residuals(T: SE3, m: Points2D3D, camera: Camera, W: Array) -> tuple[Array, Array, Array, Array]:
+    """Residual (N, 2) and Jacobian (N, 2, 6) in sigmas, Mahalanobis length (N,), pixel error (N,); invalid = infinite."""
+    x_cam = (m.xyz - T.t) @ T.R
+    uv, valid, J_cam = camera.project_with_jacobian(x_cam)
+    error = np.where(valid[:, None], uv - m.uv, 0.0)
+    J_cam = W @ np.where(valid[:, None, None], J_cam, 0.0)
+    J = np.concatenate([J_cam @ hat(x_cam), -J_cam], axis=2)
+    r = (W @ error[:, :, None])[:, :, 0]
+    size = np.where(valid, np.hypot(r[:, 0], r[:, 1]), np.inf)
+    return r, J, size, np.where(valid, np.hypot(error[:, 0], error[:, 1]), np.inf)

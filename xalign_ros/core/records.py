@@ -241,7 +241,11 @@ class AlignmentState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """All that one keyframe brought about. poses are the window's (key = keyframe id), newest last."""
+    """All that one keyframe brought about.
+
+    believed are the anchors of earlier keyframes that waited until this one's lock; poses are the window's (key =
+    keyframe id), newest last.
+    """
 
     keyframe_id: int
     session: int
@@ -250,5 +254,6 @@ class Step:
     correction: Correction | None = None
     anchor: Anchor | None = None
     rejection: Rejection | None = None
+    believed: tuple[Anchor, ...] = ()
     T_map_cam_predicted: SE3 | None = None
     poses: tuple[tuple[int, SE3], ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -91,14 +92,16 @@ class MapIndex:
         axis = map_.keyframe_R[:, :, 2]
         depth = np.einsum("ij,ij->i", axis[keyframe], map_.points[point] - map_.keyframe_t[keyframe])
         self.median_depth = np.array(
-            [np.median(depth[a:b]) if b > a else np.nan for a, b in zip(self.keyframe_offset, self.keyframe_offset[1:])]
+            [np.median(depth[a:b]) if b > a else np.nan for a, b in itertools.pairwise(self.keyframe_offset)]
         )
         self.median_depth[np.isnan(self.median_depth)] = np.nanmedian(self.median_depth) if len(depth) else 1.0
 
     def points_of(self, keyframes: np.ndarray) -> np.ndarray:
         """Sorted indices of the points seen by any of these map keyframes."""
-        runs = [self.keyframe_point[self.keyframe_offset[k] : self.keyframe_offset[k + 1]] for k in keyframes]
-        return np.unique(np.concatenate(runs)) if runs else np.zeros(0, np.int64)
+        seen = np.zeros(len(self.map.points), bool)
+        for k in keyframes:
+            seen[self.keyframe_point[self.keyframe_offset[k] : self.keyframe_offset[k + 1]]] = True
+        return np.flatnonzero(seen)
 
     def keyframes_near(self, T_map_cam: SE3, count: int) -> np.ndarray:
         """Map keyframes whose view is most like this pose's, nearest first: distance over scene depth plus angle."""
@@ -113,7 +116,7 @@ class MapIndex:
         counts = self.point_offset[points + 1] - self.point_offset[points]
         rows = np.repeat(self.point_offset[points] - np.r_[0, np.cumsum(counts)[:-1]], counts) + np.arange(counts.sum())
         weight = np.repeat(1 / np.sqrt(np.maximum(counts, 1)), counts)
-        return np.bincount(self.point_keyframe[rows], weight, minlength=len(self.map.keyframe_t))
+        return np.asarray(np.bincount(self.point_keyframe[rows], weight, minlength=len(self.map.keyframe_t)), float)
 
     def covisible(self, keyframe: int, count: int) -> np.ndarray:
         """The map keyframes that share most points with this one, itself first."""

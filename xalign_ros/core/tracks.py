@@ -52,7 +52,7 @@ def seen_twice(track: np.ndarray, frame: np.ndarray) -> np.ndarray:
 def _pairs(poses: Sequence[SE3]) -> list[tuple[int, int]]:
     """Keyframe pairs worth matching: neighbours in time, and neighbours in space that look the same way."""
     t, axis = np.array([T.t for T in poses]), np.array([T.R[:, 2] for T in poses])
-    found = set()
+    found: set[tuple[int, int]] = set()
     for a in range(len(poses)):
         found.update((a, b) for b in range(a + 1, min(a + 1 + SEQUENTIAL, len(poses))))
         alike = np.flatnonzero(axis @ axis[a] > np.cos(MAX_VIEW_RAD))

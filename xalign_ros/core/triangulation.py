@@ -13,7 +13,7 @@ HUBER = 2.0  # standard deviations
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Triangulated:
-    """xyz (M, 3) and covariance (M, 3, 3) of tracks, kept (M,); inlier (O,) and residual (O,) sigmas of observations."""
+    """Of tracks: xyz (M, 3), cov (M, 3, 3), kept (M,); of observations: inlier (O,) and residual (O,) in sigmas."""
 
     xyz: Array
     cov: Array
@@ -57,7 +57,7 @@ def triangulate(
     def summed(values: Array) -> Array:
         flat = values.reshape(len(values), -1)
         out = np.stack([np.bincount(track, flat[:, c], minlength=count) for c in range(flat.shape[1])], axis=1)
-        return out.reshape(count, *values.shape[1:])
+        return np.asarray(out.reshape(count, *values.shape[1:]), float)
 
     def linear(weight: Array) -> Array:
         P = (np.eye(3) - ray[:, :, None] * ray[:, None, :]) * weight[:, None, None]
@@ -66,15 +66,15 @@ def triangulate(
 
     def residual(xyz: Array) -> tuple[Array, Array, Array]:
         d = xyz[track] - centre
-        range_ = np.linalg.norm(d, axis=1)
-        unit = d / np.maximum(range_, 1e-12)[:, None]
+        range_ = np.maximum(np.linalg.norm(d, axis=1), 1e-12)  # a track seen once may land in its camera
+        unit = d / range_[:, None]
         r = np.einsum("oij,oj->oi", basis, unit) / sigma[:, None]
         front = np.einsum("oi,oi->o", unit, ray)
         size = np.where(front > 0, np.linalg.norm(r, axis=1), np.inf)
         return r, size, range_
 
     def normal(r: Array, range_: Array, weight: Array, xyz: Array) -> tuple[Array, Array]:
-        unit = (xyz[track] - centre) / np.maximum(range_, 1e-12)[:, None]
+        unit = (xyz[track] - centre) / range_[:, None]
         J = basis - np.einsum("oij,oj->oi", basis, unit)[:, :, None] * unit[:, None, :]
         J = J / (range_ * sigma)[:, None, None]
         Jw = J * weight[:, None, None]
@@ -100,7 +100,7 @@ def triangulate(
     trace = np.trace(H, axis1=1, axis2=2)
     ok &= np.linalg.det(H / np.maximum(trace, 1e-300)[:, None, None]) > 1e-12
     H[~ok] = np.eye(3)
-    cov = np.linalg.inv(H)
+    cov: Array = np.linalg.inv(H).astype(float)
     depth = np.full(count, np.inf)
     np.minimum.at(depth, track[good], range_[good])
     ok &= np.sqrt(np.linalg.eigvalsh(cov)[:, 2]) < max_depth_ratio * depth
@@ -109,8 +109,10 @@ def triangulate(
 
 
 def _parallax(track: np.ndarray, count: int, ray: Array, good: np.ndarray) -> Array:
-    """Twice the largest angle between a track's rays and their mean: within a factor of two of the largest between two."""
-    mean = np.stack([np.bincount(track, ray[:, c] * good, minlength=count) for c in range(3)], axis=1)
+    """Twice the largest angle between a track's rays and their mean: at most twice the largest between two of them."""
+    mean: Array = np.stack([np.bincount(track, ray[:, c] * good, minlength=count) for c in range(3)], axis=1).astype(
+        float
+    )
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
     angle = np.zeros(count)
     apart = np.linalg.norm(ray - mean[track], axis=1)

@@ -1,4 +1,4 @@
-"""The sliding Sim(3) window: an incremental fixed-lag smoother whose leaving keyframes stay behind as their marginal."""
+"""The sliding Sim(3) window: an incremental fixed-lag smoother; keyframes that leave it stay behind as their marginal."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 
 from xalign_ros.core.config import Config
 from xalign_ros.core.gtsam_bridge import anchor_factor, edge_factor, from_gtsam, prior_factor, to_gtsam
+from xalign_ros.core.lie import Array
 from xalign_ros.core.records import Anchor, RelativePose, Solution
 from xalign_ros.core.transforms import Sim3
 
@@ -14,6 +15,7 @@ WEAK_ROTATION_RAD = 1.0
 WEAK_TRANSLATION = 1e3  # odometry units
 WEAK_LOG_SCALE = 1.0
 RELINEARIZE = 1e-3  # above it Huber weights go stale
+SETTLE_UPDATES = 2  # until linearised anew, a new anchor has the Huber weight that it had at the prediction
 
 
 class Window:
@@ -24,18 +26,16 @@ class Window:
         params = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(RELINEARIZE)
         params.relinearizeSkip = 1
+        params.setFactorization("QR")  # Cholesky squares the condition: some 500 m behind the last anchor it throws
         params.findUnusedFactorSlots = True  # else the slots of marginalised factors are never used again
         self._smoother = gtsam.IncrementalFixedLagSmoother(float(config.window.keyframes) - 0.5, params)
         self._huber = config.window.huber
         self._size = config.window.keyframes
         self._key = 0
         self._ids = [keyframe_id]
-        scale = config.odometry.metric_scale_sigma if metric else WEAK_LOG_SCALE
-        sigmas = np.r_[np.full(3, WEAK_ROTATION_RAD), np.full(3, WEAK_TRANSLATION), scale]
-        start = Sim3(S_map_first.R, S_map_first.t, 1.0) if metric else S_map_first
         self._pending = gtsam.NonlinearFactorGraph()
         self._values = gtsam.Values()
-        self._pending.push_back(prior_factor(start, 0, sigmas))
+        self._pending.push_back(prior_factor(*first_prior(S_map_first, metric, config)))
         self._values.insert(0, to_gtsam(S_map_first))
         self._newest = S_map_first
 
@@ -55,7 +55,7 @@ class Window:
         """Add an anchor to the keyframe `back` places behind the newest."""
         self._pending.push_back(anchor_factor(anchor, self._key - back, self._newest.s, self._huber))
 
-    def solve(self, extra_updates: int = 0) -> Solution:
+    def solve(self, extra_updates: int = SETTLE_UPDATES) -> Solution:
         """Update with all that was added; the covariance is the newest keyframe's."""
         stamps = {key: float(key) for key in self._values.keys()}  # noqa: SIM118 - gtsam.Values is no mapping
         self._smoother.update(self._pending, self._values, stamps)
@@ -69,3 +69,10 @@ class Window:
         self._newest = poses[-1]
         cov = self._smoother.marginalCovariance(self._key)
         return Solution(tuple(self._ids[-len(keys) :]), poses, self._ids[-1], (cov + cov.T) / 2)
+
+
+def first_prior(S_map_first: Sim3, metric: bool, config: Config) -> tuple[Sim3, int, Array]:
+    """Arguments of the prior on the first keyframe of a chain: weak, but for the scale of a metric odometry."""
+    scale = config.odometry.metric_scale_sigma if metric else WEAK_LOG_SCALE
+    sigmas = np.r_[np.full(3, WEAK_ROTATION_RAD), np.full(3, WEAK_TRANSLATION), scale]
+    return (Sim3(S_map_first.R, S_map_first.t, 1.0) if metric else S_map_first), 0, sigmas

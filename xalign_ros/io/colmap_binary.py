@@ -118,6 +118,7 @@ def _gather(data: bytes, places: Ints, dtype: np.dtype[Any]) -> NDArray[Any]:
 
 def write(model: ColmapModel, folder: Path) -> None:
     """Raises OSError where the disk refuses."""
+
     def count(n: int) -> bytes:
         return np.array(n, _COUNT).tobytes()
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable
-from contextlib import closing
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,35 @@ def read_database(path: Path, names: Iterable[str]) -> dict[str, tuple[Array, ND
     Descriptors are float32 where COLMAP's `type` says so (ALIKED, LOMA) or, without a type, where the bytes say so.
     Raises MapError where the file is no such database, lacks an image or its features, or where counts do not fit.
     """
-    path, names = Path(path), list(names)
+    names = list(names)
+    with _opened(path) as db:
+        ids = dict(db.execute("SELECT name, image_id FROM images"))
+        typed = _typed(db)
+        lacking = [name for name in names if name not in ids]
+        if lacking:
+            what = f"lacks {len(lacking)} of {len(names)} images, first {lacking[0]!r}"
+            has = f"it has {len(ids)}, first {next(iter(ids), None)!r}"
+            raise MapError(f"{path}: {what} ({has}); give the database the model was made from.")
+        return {name: _features(Path(path), db, name, ids[name], typed) for name in names}
+
+
+def read_descriptor_names(path: Path, names: Iterable[str]) -> set[str]:
+    """COLMAP's names, in small letters, of the named images' descriptors: {"sift"}; empty where it says none.
+
+    Raises MapError where the file is no such database.
+    """
+    with _opened(path) as db:
+        if not _typed(db):
+            return set()
+        types = dict(db.execute("SELECT name, type FROM images JOIN descriptors USING (image_id) WHERE rows > 0"))
+    kinds = {types[name] for name in names if name in types} - {-1}
+    return {_DESCRIPTORS.get(kind, f"type {kind}").lower() for kind in kinds}
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """The database, to read from; what fails inside is a MapError."""
+    path = Path(path)
     if not read_bytes(path, 64).startswith(b"SQLite format 3\0"):
         raise MapError(f"{path}: is not an SQLite file; give the database.db the model was made from.")
     # Immutable leaves no -wal and -shm beside a file that may be on a read-only disk, but is wrong while COLMAP writes.
@@ -34,16 +62,13 @@ def read_database(path: Path, names: Iterable[str]) -> dict[str, tuple[Array, ND
     uri = path.resolve().as_uri() + "?mode=ro" + ("" if busy else "&immutable=1")
     try:
         with closing(sqlite3.connect(uri, uri=True)) as db:
-            ids = dict(db.execute("SELECT name, image_id FROM images"))
-            typed = any(column[1] == "type" for column in db.execute("PRAGMA table_info(descriptors)"))
-            lacking = [name for name in names if name not in ids]
-            if lacking:
-                what = f"lacks {len(lacking)} of {len(names)} images, first {lacking[0]!r}"
-                has = f"it has {len(ids)}, first {next(iter(ids), None)!r}"
-                raise MapError(f"{path}: {what} ({has}); give the database the model was made from.")
-            return {name: _features(path, db, name, ids[name], typed) for name in names}
+            yield db
     except (sqlite3.Error, TypeError, ValueError) as error:
         raise MapError(f"{path}: cannot be read as a COLMAP database ({error}); make it again.") from error
+
+
+def _typed(db: sqlite3.Connection) -> bool:
+    return any(column[1] == "type" for column in db.execute("PRAGMA table_info(descriptors)"))
 
 
 def _features(path: Path, db: sqlite3.Connection, name: str, image_id: int, typed: bool) -> tuple[Array, NDArray[Any]]:

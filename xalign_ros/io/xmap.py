@@ -33,7 +33,7 @@ ARRAYS = {
 
 
 def write_map(map_: ReferenceMap, folder: Path, *, force: bool = False) -> str:
-    """Write a map and return its version (from the arrays' checksums). Raises MapError where `folder` exists, unless forced."""
+    """Write a map; returns its version, from the arrays' checksums. Raises MapError where `folder` exists, unless forced."""
     folder = Path(folder)
     if folder.exists() and not force:
         raise MapError(f"{folder} exists; give another name or --force to replace it")

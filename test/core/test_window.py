@@ -1,0 +1,342 @@
+"""The fixed-lag window against a batch solve of the whole problem; edges, predictions and what leaves the window."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+import worlds
+
+from xalign_ros.core.config import Config, Odometry, with_options
+from xalign_ros.core.gtsam_bridge import anchor_factor, edge_factor, from_gtsam, prior_factor, to_gtsam
+from xalign_ros.core.odometry import METRIC_WALK, edge_between, odom_in_map, pose_covariance, predict
+from xalign_ros.core.records import Anchor, Features, Keyframe, Solution
+from xalign_ros.core.transforms import SE3, Sim3
+from xalign_ros.core.window import WEAK_LOG_SCALE, WEAK_ROTATION_RAD, WEAK_TRANSLATION, Window
+
+CONFIG = Config()
+SIGMA_RAD, SIGMA_M = 0.002, 0.02
+COV = np.diag([SIGMA_RAD] * 3 + [SIGMA_M] * 3) ** 2
+NOTHING = Features(np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
+
+
+def keyframes_of(T_odom_cam, **fields):
+    return [Keyframe(n, 1, 10 + n, T, worlds.CAMERA, NOTHING, **fields) for n, T in enumerate(T_odom_cam)]
+
+
+def anchor_at(T_map_cam, n, rng, cov=COV):
+    noise = SE3.exp(np.linalg.cholesky(cov) @ rng.normal(size=6))
+    return Anchor(10 + n, 1, n, T_map_cam @ noise, cov, 50, 50, 1.0)
+
+
+def drive(count, seed, metric=False):
+    """Truth, true S_map_i and keyframes of an odometry drawn from the model."""
+    rng = np.random.default_rng([12, seed])
+    truth = worlds.along_line(count, 0.5)
+    start = Sim3(np.eye(3), rng.normal(size=3), 1.0) if metric else worlds.any_similarity(rng)
+    T, S = worlds.drifting(truth, rng, CONFIG.odometry, start, metric)
+    return truth, S, keyframes_of(T, metric_scale=metric), rng
+
+
+def in_sigmas(a, b, cov):
+    d = (a.inverse() @ b).log()
+    return float(np.sqrt(d @ np.linalg.solve(cov, d)))
+
+
+class Both:
+    """The same factors in a window and in one graph that forgets nothing."""
+
+    def __init__(self, S_first, config):
+        self.window, self.config = Window(S_first, 10, False, config), config
+        self.graph, self.start, self.key, self.newest = gtsam.NonlinearFactorGraph(), gtsam.Values(), 0, S_first
+        weak = np.r_[[WEAK_ROTATION_RAD] * 3, [WEAK_TRANSLATION] * 3, WEAK_LOG_SCALE]
+        self.graph.push_back(prior_factor(S_first, 0, weak))
+        self.start.insert(0, to_gtsam(S_first))
+
+    def step(self, edge, anchor):
+        if edge is not None:
+            self.window.extend(edge)
+            self.key += 1
+            self.graph.push_back(edge_factor(edge, self.key - 1, self.key))
+            self.newest = self.newest @ edge.T_i_j
+            self.start.insert(self.key, to_gtsam(self.newest))
+        if anchor is not None:
+            self.window.attach(anchor)
+            self.graph.push_back(anchor_factor(anchor, self.key, self.newest.s, self.config.window.huber))
+        solution = self.window.solve()
+        self.newest = solution.S_map_i[-1]
+        return solution
+
+    def batch(self):
+        """Newest node and its covariance (7, 7)."""
+        found = gtsam.LevenbergMarquardtOptimizer(self.graph, self.start).optimize()
+        S = from_gtsam(found.atSimilarity3(self.key))
+        return S, gtsam.Marginals(self.graph, found).marginalCovariance(self.key)
+
+
+@pytest.mark.parametrize("anchors_every", [1, 4, 9])
+@pytest.mark.parametrize("seed", range(2))
+def test_the_window_is_the_whole_problem(anchors_every, seed):
+    """Ten keyframes of forty: newest within 0.1 sigma of the batch, covariance within 10 %, all along."""
+    config = with_options(CONFIG, {"window.keyframes": 10}, "test")
+    truth, S, keyframes, rng = drive(40, seed)
+    both = Both(S[0], config)
+    for n, keyframe in enumerate(keyframes):
+        edge = edge_between(keyframes[n - 1], keyframe, both.newest.s, config.odometry) if n else None
+        anchor = anchor_at(truth[n], n, rng) if n % anchors_every == 0 or n == 1 else None
+        solution = both.step(edge, anchor)
+        if n in (9, 20, 30, 39):
+            want, cov = both.batch()
+            assert in_sigmas(solution.S_map_i[-1], want, cov) < 0.1
+            sd, sd_want = np.sqrt(np.diag(solution.cov)), np.sqrt(np.diag(cov))
+            np.testing.assert_allclose(sd, sd_want, rtol=0.05)  # of a sigma: 10 % of the covariance
+            whitened = np.linalg.solve(np.linalg.cholesky(cov), solution.cov) @ np.linalg.inv(np.linalg.cholesky(cov)).T
+            np.testing.assert_allclose(np.linalg.eigvalsh(whitened), 1, atol=0.1)
+
+
+def test_one_wrong_anchor_leaves_the_window_where_the_batch_is():
+    """With Huber at work, and after the wrong one has left."""
+    config = with_options(CONFIG, {"window.keyframes": 8}, "test")
+    truth, S, keyframes, rng = drive(30, 5)
+    both = Both(S[0], config)
+    for n, keyframe in enumerate(keyframes):
+        edge = edge_between(keyframes[n - 1], keyframe, both.newest.s, config.odometry) if n else None
+        anchor = anchor_at(truth[n], n, rng)
+        if n == 12:
+            anchor = replace(anchor, T_map_cam=SE3(anchor.T_map_cam.R, [*anchor.T_map_cam.t, 0, 0.3, 0]))
+        solution = both.step(edge, anchor)
+        if n in (14, 29):
+            want, cov = both.batch()
+            assert in_sigmas(solution.S_map_i[-1], want, cov) < (0.1 if n == 29 else 0.3)
+
+
+@pytest.mark.parametrize("metric", [False, True])
+def test_the_covariance_is_true(metric):
+    """Mean NEES, 7 degrees of freedom, of 60 runs at two keyframes far apart: within 99 % of chi-square.
+
+    Anchors as sharp as those of a good map: their Huber weight must be that of where they end, not of the prediction.
+    """
+    sharp = np.diag([0.0004] * 3 + [0.004] * 3) ** 2
+    nees = []
+    for seed in range(60):
+        truth, S, keyframes, rng = drive(24, 100 + seed, metric)
+        window, scale = Window(S[0], 10, metric, CONFIG), S[0].s
+        for n, keyframe in enumerate(keyframes):
+            if n:
+                window.extend(edge_between(keyframes[n - 1], keyframe, scale, CONFIG.odometry))
+            window.attach(anchor_at(truth[n], n, rng, sharp))
+            solution = window.solve()
+            scale = solution.S_map_i[-1].s
+            if n in (11, 23):
+                e = (solution.S_map_i[-1].inverse() @ S[n]).log()
+                nees.append(e @ np.linalg.solve(solution.cov, e))
+    assert np.mean(nees) == pytest.approx(7, abs=2.58 * np.sqrt(14 / len(nees)))
+
+
+def test_a_metric_window_starts_at_scale_one():
+    """A prior of 1 % on the scale, one anchor, nothing else."""
+    truth, _, _, rng = drive(2, 3, metric=True)
+    window = Window(truth[0].as_sim3(), 10, True, CONFIG)
+    window.attach(anchor_at(truth[0], 0, rng))
+    solution = window.solve()
+    assert np.sqrt(solution.cov[6, 6]) == pytest.approx(CONFIG.odometry.metric_scale_sigma, rel=0.01)
+    assert solution.S_map_i[0].s == pytest.approx(1.0, abs=1e-6)
+    free = Window(truth[0].as_sim3(), 10, False, CONFIG)
+    free.attach(anchor_at(truth[0], 0, rng))
+    assert np.sqrt(free.solve().cov[6, 6]) == pytest.approx(WEAK_LOG_SCALE, rel=0.02)
+
+
+# Size ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_window_holds_as_many_keyframes_as_it_may():
+    config = with_options(CONFIG, {"window.keyframes": 5}, "test")
+    truth, S, keyframes, rng = drive(20, 6)
+    window = Window(S[0], 10, False, config)
+    for n, keyframe in enumerate(keyframes):
+        if n:
+            window.extend(edge_between(keyframes[n - 1], keyframe, S[n].s, config.odometry))
+        window.attach(anchor_at(truth[n], n, rng))
+        solution = window.solve()
+        want = tuple(range(10 + max(0, n - 4), 11 + n))
+        assert solution.keys == want and len(window) == len(solution.S_map_i) == len(want)
+        assert solution.cov_key == 10 + n
+
+
+def test_more_keyframes_at_once_than_the_window_holds():
+    """As a lock over a long memory brings them."""
+    config = with_options(CONFIG, {"window.keyframes": 5}, "test")
+    truth, S, keyframes, rng = drive(20, 7)
+    window = Window(S[0], 10, False, config)
+    for n, keyframe in enumerate(keyframes):
+        if n:
+            window.extend(edge_between(keyframes[n - 1], keyframe, S[0].s, config.odometry))
+        window.attach(anchor_at(truth[n], n, rng))
+    solution = window.solve(3)
+    assert solution.keys == (25, 26, 27, 28, 29)
+    assert in_sigmas(solution.S_map_i[-1], S[-1], solution.cov) < 5
+
+
+def test_a_window_without_anchors_carries_the_odometry():
+    truth, S, keyframes, _ = drive(15, 8)
+    window = Window(S[0], 10, False, CONFIG)
+    for n in range(1, 15):
+        window.extend(edge_between(keyframes[n - 1], keyframes[n], S[0].s, CONFIG.odometry))
+        solution = window.solve()
+    want = S[0] @ keyframes[0].T_odom_cam.inverse() @ keyframes[-1].T_odom_cam
+    np.testing.assert_allclose(solution.S_map_i[-1].t, want.t, atol=1e-6)
+    assert solution.S_map_i[-1].s == pytest.approx(S[0].s)
+    assert np.sqrt(solution.cov[3, 3]) * S[0].s > 10  # nobody knows where it is
+
+
+def test_far_behind_the_last_anchor_the_window_still_stands():
+    """A kilometre and a half without one: the sigma has grown to hundreds of metres, and nothing throws."""
+    config = with_options(CONFIG, {"window.keyframes": 5}, "test")
+    step = SE3([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0, 0, 5.0])
+    T = SE3.identity()
+    window = Window(T.as_sim3(), 0, False, config)
+    keyframe = keyframes_of([T])[0]
+    sigmas = []
+    for n in range(301):
+        if n:
+            following = replace(keyframe, id=keyframe.id + 1, T_odom_cam=keyframe.T_odom_cam @ step)
+            window.extend(edge_between(keyframe, following, 1.0, config.odometry))
+            keyframe = following
+        if n < 5:
+            window.attach(Anchor(n, 1, n, keyframe.T_odom_cam, COV, 50, 50, 1.0))
+        solution = window.solve()
+        sigmas.append(np.sqrt(np.trace(pose_covariance(solution.S_map_i[-1], solution.cov)[3:, 3:])))
+    np.testing.assert_allclose(solution.S_map_i[-1].t, [0, 0, 1500], atol=1e-3)
+    assert (np.diff(sigmas[10:]) > 0).all() and sigmas[-1] > 200
+
+
+def test_standing_still_is_no_error():
+    """Edges of no length, anchors at one spot: the position is known, the scale is not."""
+    rng = np.random.default_rng(14)
+    keyframes = keyframes_of([SE3.exp([0, 0.2 * n, 0, 0, 0, 0]) for n in range(20)])
+    window = Window(Sim3(np.eye(3), np.zeros(3), 1.0), 10, False, CONFIG)
+    for n, keyframe in enumerate(keyframes):
+        if n:
+            window.extend(edge_between(keyframes[n - 1], keyframe, 1.0, CONFIG.odometry))
+        window.attach(anchor_at(keyframe.T_odom_cam, n, rng))
+        solution = window.solve()
+    assert np.linalg.norm(solution.S_map_i[-1].t) < 0.05
+    assert np.sqrt(solution.cov[6, 6]) > 0.5
+
+
+def test_a_window_of_one_and_solving_for_nothing_new():
+    truth, S, _, rng = drive(2, 9)
+    window = Window(S[0], 10, False, CONFIG)
+    first = window.solve()
+    assert first.keys == (10,) and len(window) == 1
+    again = window.solve()
+    np.testing.assert_allclose(again.S_map_i[0].t, first.S_map_i[0].t, atol=1e-9)
+    window.attach(anchor_at(truth[0], 0, rng, COV / 1e8))
+    np.testing.assert_allclose(window.solve().S_map_i[0].t, truth[0].t, atol=1e-4)
+
+
+def test_two_windows_give_the_same_bits():
+    def solve():
+        truth, S, keyframes, rng = drive(12, 10)
+        window = Window(S[0], 10, False, CONFIG)
+        for n, keyframe in enumerate(keyframes):
+            if n:
+                window.extend(edge_between(keyframes[n - 1], keyframe, S[n].s, CONFIG.odometry))
+            window.attach(anchor_at(truth[n], n, rng))
+            solution = window.solve()
+        return solution
+
+    a, b = solve(), solve()
+    assert np.array_equal(a.cov, b.cov)
+    assert all(np.array_equal(x.t, y.t) and np.array_equal(x.R, y.R) for x, y in zip(a.S_map_i, b.S_map_i, strict=True))
+
+
+# Odometry: edges and what they do to a prediction -------------------------------------------------------------------
+
+
+def two_keyframes(metres, scale=1.0, **fields):
+    T = [SE3.identity(), SE3(np.eye(3), [0, 0, metres / scale])]
+    return keyframes_of(T, **fields)
+
+
+def test_edge_noise_by_hand():
+    """Four metres at a scale of half a metre per unit: translation sigmas are in units."""
+    o = Odometry()
+    i, j = two_keyframes(4.0, 0.5)
+    edge = edge_between(i, j, 0.5, o)
+    np.testing.assert_allclose(edge.T_i_j.t, [0, 0, 8])
+    assert edge.sigmas[0] == pytest.approx(np.hypot(0.0005, 0.004 * 2))
+    assert edge.sigmas[3] == pytest.approx(np.hypot(0.001, 0.015 * 4) / 0.5)
+    assert edge.sigmas[6] == pytest.approx(0.02 * 2)
+    assert (edge.i, edge.j) == (i.id, j.id)
+    metric = edge_between(*two_keyframes(4.0, 1.0, metric_scale=True), 1.0, o)
+    assert metric.sigmas[6] == pytest.approx(METRIC_WALK * o.metric_scale_sigma * 2)
+
+
+def test_an_edge_of_no_length_has_noise():
+    edge = edge_between(*two_keyframes(0.0), 1.0, Odometry())
+    assert (edge.sigmas > 0).all()
+
+
+def marginals(truth, Q):
+    """Marginal covariances (6, 6) of an odometry whose every edge has noise Q, right perturbation, camera axes."""
+    C, found = np.zeros((6, 6)), []
+    for n, T in enumerate(truth):
+        if n:
+            Ad = (T.inverse() @ truth[n - 1]).as_sim3().adjoint()[:6, :6]
+            C = Ad @ C @ Ad.T + Q
+        found.append(C)
+    return found
+
+
+@pytest.mark.parametrize("at", [0, 20, 150])
+def test_an_edge_is_raised_to_the_growth_of_the_sources_covariance(at):
+    """To the source's own noise of this edge where that is larger, however far it has come since its session began."""
+    truth = worlds.along_line(152, 0.5)
+    for Q, raised in ((np.diag([0.02] * 3 + [0.05] * 3) ** 2, True), (np.diag([0.001] * 3 + [0.002] * 3) ** 2, False)):
+        C = marginals(truth, Q)
+        i, j = (Keyframe(n, 1, n, truth[n], worlds.CAMERA, NOTHING, cov_cam=C[n]) for n in (at, at + 1))
+        sigmas = edge_between(i, j, 1.0, Odometry()).sigmas
+        model = edge_between(replace(i, cov_cam=None), j, 1.0, Odometry()).sigmas
+        want = np.r_[np.sqrt(np.diag(Q)), model[6]] if raised else model
+        np.testing.assert_allclose(sigmas, want, rtol=1e-6)
+
+
+def test_a_prediction_is_as_uncertain_as_it_errs():
+    """2000 draws from the model against the predicted covariance, scale uncertainty of the start included."""
+    rng = np.random.default_rng(13)
+    S = Sim3.exp([0.3, 0.2, 0.1, 1, 2, 3, -0.7])
+    cov = np.diag([0.003] * 3 + [0.03] * 3 + [0.05]) ** 2
+    edge = edge_between(*two_keyframes(2.0, S.s), S.s, Odometry())
+    mean, predicted = predict(Solution((1,), (S,), 1, cov), edge)
+    np.testing.assert_allclose(mean.t, (S @ edge.T_i_j).t)
+    draws = np.array(
+        [
+            (
+                mean.inverse()
+                @ (S @ Sim3.exp(rng.normal(size=7) * np.sqrt(np.diag(cov))) @ edge.T_i_j.as_sim3())
+                @ Sim3.exp(rng.normal(size=7) * edge.sigmas)
+            ).log()
+            for _ in range(2000)
+        ]
+    )
+    whitened = np.linalg.solve(np.linalg.cholesky(predicted), draws.T)
+    np.testing.assert_allclose(np.cov(whitened), np.eye(7), atol=0.15)
+    assert (np.diag(predicted) > np.diag(cov) - 1e-12).all()
+    ahead = np.sqrt(predicted[5, 5]) * S.s
+    assert ahead > 0.05 * 2.0  # 5 % of scale over 2 m
+
+
+def test_scale_uncertainty_is_not_forgotten_in_the_map():
+    """pose_covariance: metres; odom_in_map: the same knowledge at the odometry's origin."""
+    S = Sim3(np.eye(3), [10, 0, 0], 0.5)
+    cov = np.diag([0.01] * 3 + [0.2] * 3 + [0.1]) ** 2
+    np.testing.assert_allclose(np.sqrt(np.diag(pose_covariance(S, cov))), [0.01] * 3 + [0.1] * 3)
+    T_odom_i = SE3(np.eye(3), [0, 0, 4])
+    S_map_odom, cov_odom = odom_in_map(S, cov, T_odom_i)
+    np.testing.assert_allclose(S_map_odom.t, [10, 0, -2])
+    assert S_map_odom.s == 0.5
+    # Back to the keyframe: nothing was lost or added.
+    Ad = T_odom_i.inverse().as_sim3().adjoint()
+    np.testing.assert_allclose(Ad @ cov_odom @ Ad.T, cov, atol=1e-12)
+    assert np.sqrt(cov_odom[5, 5]) == pytest.approx(np.hypot(0.2, 0.1 * 4))

@@ -1,0 +1,117 @@
+"""What a run leaves behind, live and in replay alike: log of its messages, figures, trajectory, report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xalign_ros.core.errors import FormatError
+from xalign_ros.core.evaluation import summarize, summarize_errors
+from xalign_ros.core.records import Step
+from xalign_ros.core.reference_map import ReferenceMap
+from xalign_ros.core.transforms import SE3
+from xalign_ros.io.log import LogWriter
+from xalign_ros.io.step_messages import TOPICS
+from xalign_ros.io.tum import Trajectory, pose_at, read_tum, write_tum
+
+
+@dataclass(slots=True)
+class Run:
+    """Per keyframe: its step, the step's duration (s), and T_odom_cam or None."""
+
+    steps: list[Step] = field(default_factory=list)
+    step_s: list[float] = field(default_factory=list)
+    odometry: list[SE3 | None] = field(default_factory=list)
+
+    def add(self, step: Step, seconds: float, T_odom_cam: SE3 | None) -> None:
+        self.steps.append(step)
+        self.step_s.append(seconds)
+        self.odometry.append(T_odom_cam)
+
+
+class OutputLog:
+    """The output log, open while the run goes on; nothing remains of it if the run fails. Without a path: nothing."""
+
+    def __init__(self, path: Path | None, stack: ExitStack) -> None:
+        self._log = stack.enter_context(LogWriter(path)) if path else None
+        if self._log:
+            for topic, name in TOPICS.items():
+                self._log.channel(topic, name)
+
+    def write(self, messages: Mapping[str, Any], stamp_ns: int) -> None:
+        """A step's messages (rosbags classes) by topic."""
+        if self._log:
+            for topic, message in messages.items():
+                self._log.write(topic, TOPICS[topic], message, stamp_ns)
+
+
+def read_truth(path: Path | None) -> Trajectory | None:
+    if path is None:
+        return None
+    truth = read_tum(path)
+    if not len(truth.stamps_ns):
+        raise FormatError(f"{path} holds no pose; --truth needs TUM rows of T_map_cam")
+    return truth
+
+
+def write_results(
+    run: Run,
+    digest: str,
+    truth: Trajectory | None,
+    map_: ReferenceMap,
+    *,
+    trajectory: Path | None,
+    report: Path | None,
+    title: str,
+) -> dict[str, Any]:
+    """The figures of the run, once trajectory and report are written where a path is given."""
+    true = [pose_at(truth, s.stamp_ns) for s in run.steps] if truth is not None else None
+    result = summarize(run.steps, run.step_s, digest)
+    if true is not None:
+        result |= summarize_errors(run.steps, run.odometry, true)
+    if trajectory:
+        write_tum(trajectory, _trajectory(run.steps))
+    if report:
+        from xalign_ros.io.report import write_report  # its plotting library takes a second to import
+
+        write_report(report, result, run.steps, run.step_s, run.odometry, true, map_, title=title)
+    return result
+
+
+def _trajectory(steps: Sequence[Step]) -> Trajectory:
+    """By time: a new session may begin with an earlier stamp."""
+    at = {s.correction.stamp_ns: s.correction for s in steps if s.correction is not None}
+    known = [at[stamp_ns] for stamp_ns in sorted(at)]
+    return Trajectory(
+        np.array(sorted(at), np.int64),
+        np.array([c.T_map_cam.R for c in known]).reshape(-1, 3, 3),
+        np.array([c.T_map_cam.t for c in known]).reshape(-1, 3),
+    )
+
+
+def remark(steps: Sequence[Step]) -> str:
+    """What the figures alone would not say; empty where they say it all."""
+    if not steps:
+        return "the log has no keyframes: nothing was aligned"
+    if not any(s.correction for s in steps):
+        return f"never locked: {steps[-1].state.reason}; no pose was published"
+    return ""
+
+
+def in_words(result: Mapping[str, Any]) -> str:
+    """The result as aligned lines, in the order of the JSON object."""
+    lines = []
+    for key, value in result.items():
+        if isinstance(value, dict):
+            value = "  ".join(f"{k} {_short(v)}" for k, v in value.items() if v) or "none"
+        lines.append(f"{key:22s} {_short(value)}")
+    return "\n".join(lines)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else "-" if value is None else str(value)
