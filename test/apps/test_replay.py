@@ -226,3 +226,14 @@ def test_wrong_usage_is_two() -> None:
     with pytest.raises(SystemExit) as stop:
         main(["replay"])
     assert stop.value.code == 2
+
+
+def test_a_report_does_not_replace_the_run_s_own_files(world, tmp_path, capsys) -> None:
+    import shutil
+
+    shutil.copytree(world[0], tmp_path / "in")
+    (tmp_path / "in" / "index.html").write_text('<meta name="generator" content="xalign_ros report">')
+    words = ["replay", tmp_path / "in" / "run.mcap", "--map", tmp_path / "in" / "m.xmap", "--report", tmp_path / "in"]
+    assert main([str(w) for w in words]) == 1
+    assert "report folder" in capsys.readouterr().err
+    assert (tmp_path / "in" / "run.mcap").exists()

@@ -149,7 +149,7 @@ def test_beyond_the_fold_of_a_barrel_distortion_nothing_is_valid():
     fold = np.sqrt(1 / 1.2)
     assert camera.limit == pytest.approx(fold, rel=5e-3)
     x = np.array([[fold - 0.01, 0, 1], [fold + 0.01, 0, 1], [1.5, 0, 1]])
-    uv, valid = camera.project(x)
+    _, valid = camera.project(x)
     assert valid.tolist() == [True, False, False]
     top = K[2] + K[0] * fold * (1 - 0.4 * fold**2)
     rays, found = camera.unproject([[top - 1, K[3]], [top + 1, K[3]]])

@@ -1,5 +1,7 @@
 """Which waiting anchors agree under one similarity: all that do, none that do not, none where it cannot be told."""
 
+import itertools
+
 import numpy as np
 import pytest
 import worlds
@@ -9,7 +11,6 @@ from xalign_ros.core.consensus import Witness, find_consensus
 from xalign_ros.core.lie import so3_exp
 from xalign_ros.core.records import Anchor
 from xalign_ros.core.transforms import SE3, Sim3
-import itertools
 
 CONFIG = Config()
 SIGMA_RAD, SIGMA_M = 0.002, 0.01
@@ -157,7 +158,9 @@ def test_drift_within_the_noise_model_is_no_disagreement():
         path = np.r_[0, np.cumsum([np.linalg.norm(b.t - a.t) for a, b in itertools.pairwise(T_odom_cam)])]
         found = find_consensus(
             [
-                Witness(Anchor(n, 1, n, T @ SE3.exp(rng.normal(size=6) * np.sqrt(np.diag(COV))), COV, 50, 50, 1.0), o, p)
+                Witness(
+                    Anchor(n, 1, n, T @ SE3.exp(rng.normal(size=6) * np.sqrt(np.diag(COV))), COV, 50, 50, 1.0), o, p
+                )
                 for n, (T, o, p) in enumerate(zip(poses, T_odom_cam, path, strict=True))
             ],
             False,

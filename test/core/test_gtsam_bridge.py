@@ -144,7 +144,7 @@ def test_the_scale_of_an_anchor_is_free():
     T = SE3(LEFT, [10, 0, 0])
     factor = anchor_factor(an_anchor(T), 0, 1.0, NO_HUBER)
     assert factor.error(values(n0=Sim3(T.R, T.t, 2.0))) < 0.005
-    assert factor.error(values(n0=Sim3(T.R, [*T.t, 0, 0.2, 0], 1.0))) == pytest.approx(2.0, rel=1e-6)
+    assert factor.error(values(n0=Sim3(T.R, T.t + np.array([0, 0.2, 0]), 1.0))) == pytest.approx(2.0, rel=1e-6)
 
 
 def test_huber_bounds_what_one_anchor_can_pull():
@@ -197,7 +197,9 @@ def test_prior_by_hand():
     sigmas = np.array([0.1, 0.1, 0.1, 5, 5, 5, 0.5])
     factor = prior_factor(S, 0, sigmas)
     np.testing.assert_allclose(
-        factor.whitenedError(values(n0=S @ Sim3.exp(np.r_[0, 0, 0.2, 0, 0, 0, 0]))), np.r_[0, 0, 2, 0, 0, 0, 0], atol=1e-9
+        factor.whitenedError(values(n0=S @ Sim3.exp(np.r_[0, 0, 0.2, 0, 0, 0, 0]))),
+        np.r_[0, 0, 2, 0, 0, 0, 0],
+        atol=1e-9,
     )
     moved = values(n0=Sim3(LEFT, [1, 2, 23], 2.0))  # 20 m are 10 units are 2 sigmas
     np.testing.assert_allclose(factor.whitenedError(moved), np.r_[0, 0, 0, 0, 0, 2, 0], atol=1e-9)

@@ -96,7 +96,7 @@ def test_every_point_has_two_observations_and_a_covariance(built):
 
 
 def test_the_descriptor_gate_parts_own_from_others(run, built):
-    points, codes, rng = landmarks()
+    _, codes, rng = landmarks()
     which = landmark_of_points(built, run)
     own = pair_distance(built.descriptors, worlds.flipped(codes[which], rng, worlds.FLIP), Norm.HAMMING)
     other = pair_distance(built.descriptors, np.roll(codes[which], 1, axis=0), Norm.HAMMING)
@@ -224,7 +224,9 @@ def test_two_cameras_stay_two():
 
 
 def test_what_is_no_map_is_an_error(run):
-    floats = Features(run[0].features.uv, np.zeros((len(run[0].features), 8), np.float32), "superpoint", Norm.L2_FLOAT32)
+    floats = Features(
+        run[0].features.uv, np.zeros((len(run[0].features), 8), np.float32), "superpoint", Norm.L2_FLOAT32
+    )
     none = Features(np.zeros((0, 2)), np.zeros((0, 32), np.uint8), "code")
     with pytest.raises(ValueError, match="2 kinds of descriptors"):
         build([replace(run[0], features=floats), *run[1:]])

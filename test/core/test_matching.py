@@ -109,7 +109,7 @@ def twin_map(world, distance_m):
         point += [rows[s], np.where(rows[s] >= 0, rows[s] + count, -1)]
     return replace(
         m,
-        points=np.vstack([m.points, [*m.points, distance_m, 0, 0]]),
+        points=np.vstack([m.points, m.points + np.array([distance_m, 0, 0])]),
         point_cov=np.concatenate([m.point_cov] * 2),
         descriptors=np.vstack([m.descriptors] * 2),
         feature_offset=offset,
@@ -162,7 +162,9 @@ def test_beyond_the_descriptor_gate_is_no_match(world, index):
     rng = np.random.default_rng(1)
     far = replace(features, descriptors=worlds.flipped(features.descriptors, rng, 0.33))
     m = place_matches(far, index, index.keyframes_near(T, 10), CONFIG)
-    assert (pair_distance(far.descriptors[m.feature], world.map.descriptors[m.point], world.map.norm) <= 0.45 * 256).all()
+    assert (
+        pair_distance(far.descriptors[m.feature], world.map.descriptors[m.point], world.map.norm) <= 0.45 * 256
+    ).all()
     assert len(m) < 30 and len(guided(world, index, T, far)) < 30
 
 

@@ -117,7 +117,7 @@ def test_covariance_by_hand():
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_the_same_pose():
-    T, m = problem(3, 200, sigma_px=0.7, wrong=0.5)
+    _, m = problem(3, 200, sigma_px=0.7, wrong=0.5)
     a, b = (estimate_pose(m, worlds.CAMERA, 7, CONFIG) for _ in range(2))
     assert np.array_equal(a.T_map_cam.matrix(), b.T_map_cam.matrix()) and np.array_equal(a.cov_cam, b.cov_cam)
     c = estimate_pose(m, worlds.CAMERA, 8, CONFIG)

@@ -46,7 +46,9 @@ def test_similarity_group(a, b, c):
 @given(similarities, similarities, translations)
 def test_a_product_acts_as_one_after_the_other(a, b, x):
     want = a.apply(b.apply(x))
-    np.testing.assert_allclose((a @ b).apply(x), want, atol=1e-12 * a.s * (np.abs(b.apply(x)).max() + np.abs(want).max()))
+    np.testing.assert_allclose(
+        (a @ b).apply(x), want, atol=1e-12 * a.s * (np.abs(b.apply(x)).max() + np.abs(want).max())
+    )
 
 
 @given(similarities, rigid)

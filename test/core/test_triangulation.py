@@ -82,7 +82,7 @@ def test_one_wrong_observation_of_many_is_dropped():
     points, track, centre, rng = scene()
     rays = noisy(rays_to(points[track], centre), rng)
     wrong = np.array([np.flatnonzero(track == n)[0] for n in range(50)])
-    rays[wrong] = rays_to(points[track[wrong]] + [0.4, -0.3, 0], centre[wrong])
+    rays[wrong] = rays_to(points[track[wrong]] + np.array([0.4, -0.3, 0]), centre[wrong])
     found = triangulate(track, len(points), centre, rays, np.full(len(track), SIGMA))
     assert not found.inlier[wrong].any() and (found.residual[wrong] > 4).all()
     right = np.ones(len(track), bool)

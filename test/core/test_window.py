@@ -103,7 +103,7 @@ def test_one_wrong_anchor_leaves_the_window_where_the_batch_is():
         edge = edge_between(keyframes[n - 1], keyframe, both.newest.s, config.odometry) if n else None
         anchor = anchor_at(truth[n], n, rng)
         if n == 12:
-            anchor = replace(anchor, T_map_cam=SE3(anchor.T_map_cam.R, [*anchor.T_map_cam.t, 0, 0.3, 0]))
+            anchor = replace(anchor, T_map_cam=SE3(anchor.T_map_cam.R, anchor.T_map_cam.t + np.array([0, 0.3, 0])))
         solution = both.step(edge, anchor)
         if n in (14, 29):
             want, cov = both.batch()
@@ -178,7 +178,7 @@ def test_more_keyframes_at_once_than_the_window_holds():
 
 
 def test_a_window_without_anchors_carries_the_odometry():
-    truth, S, keyframes, _ = drive(15, 8)
+    _, S, keyframes, _ = drive(15, 8)
     window = Window(S[0], 10, False, CONFIG)
     for n in range(1, 15):
         window.extend(edge_between(keyframes[n - 1], keyframes[n], S[0].s, CONFIG.odometry))

@@ -7,6 +7,7 @@ covariance can be held against its errors: S_map_j = S_map_i Z Exp(n) with Z wha
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,7 +21,6 @@ from xalign_ros.core.odometry import METRIC_WALK
 from xalign_ros.core.records import NO_TRACK, Features, Keyframe
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3, Sim3
-import itertools
 
 CAMERA = Camera("radtan", [420.0, 420.0, 319.5, 239.5], [-0.05, 0.01, 0.0005, -0.0005], 640, 480)
 SIGMA_PX = 0.7  # of a keypoint
@@ -136,7 +136,9 @@ def drifting(
         metres = float(np.linalg.norm(b.t - a.t))
         turn = np.hypot(noise.rotation_floor_rad, noise.rotation_rad_per_sqrt_m * np.sqrt(metres))
         shift = np.hypot(noise.translation_floor_m, noise.translation_ratio * metres) / S[-1].s
-        walk = (METRIC_WALK * noise.metric_scale_sigma if metric else noise.scale_per_sqrt_m) * np.sqrt(max(metres, 1e-4))
+        walk = (METRIC_WALK * noise.metric_scale_sigma if metric else noise.scale_per_sqrt_m) * np.sqrt(
+            max(metres, 1e-4)
+        )
         n = rng.normal(size=7) * np.r_[[turn] * 3, [shift] * 3, walk]
         S.append(Sim3(b.R, b.t, S[-1].s * float(np.exp(n[6]))))
         Z = S[-2].inverse() @ S[-1] @ Sim3.exp(n).inverse()
@@ -248,7 +250,7 @@ def look_alike_corridor(seed: int = 0, step: float = 0.65, flip: float = FLIP) -
     rng = np.random.default_rng([4, seed])
     parts = [scattered(rng, [n * PLACE_M, 1.5, -2.5], [(n + 1) * PLACE_M, 7, 2.5], 350) for n in range(5)]
     codes = coded(rng, 5 * 350).reshape(5, 350, 32)
-    parts[3], codes[3] = parts[1] + [2 * PLACE_M, 0, 0], codes[1]
+    parts[3], codes[3] = parts[1] + np.array([2 * PLACE_M, 0, 0]), codes[1]
     points, codes = np.vstack(parts), codes.reshape(-1, 32)
     poses = [corridor_camera(x) for x in np.arange(0.5, 5 * PLACE_M - 0.5, step)]
     map_ = map_of(points, codes, poses, "look_alike_corridor", seed, flip)

@@ -34,7 +34,7 @@ from xalign_ros.core.records import (
 )
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3, Sim3
-from xalign_ros.io import report
+from xalign_ros.io import report, report_pictures, report_run
 from xalign_ros.io.report import write_report
 
 STEP_NS = 500_000_000
@@ -173,7 +173,7 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def quick(monkeypatch):
     """Where pictures are not the question."""
-    monkeypatch.setattr(report, "_draw", lambda run: {"scale.png": ("Scale", b"PNG")})
+    monkeypatch.setattr(report, "draw_all", lambda run: {"scale.png": ("Scale", b"PNG")})
 
 
 # -- what is written -------------------------------------------------------------------------------------------------
@@ -280,7 +280,7 @@ RUNS = {
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", RUNS)
 def test_runs_out_of_the_ordinary(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "STYLE", report.STYLE.replace(f"dpi={report.DPI}", "dpi=60"))
+    monkeypatch.setattr(report_pictures, "STYLE", report_pictures.STYLE.replace(f"dpi={report_pictures.DPI}", "dpi=60"))
     run, truth, words = RUNS[name]
     write(tmp_path / "out", run, truth=truth)
     have = {p.name for p in (tmp_path / "out").iterdir()}
@@ -290,20 +290,20 @@ def test_runs_out_of_the_ordinary(name, tmp_path, monkeypatch):
 
 
 def test_no_output_claims_metres_of_a_map_without_scale(tmp_path, quick):
-    run = report._Run(*a_run(), a_map(metric=False))
+    run = report_run.Run(*a_run(), a_map(metric=False))
     write(tmp_path / "out", map_=a_map(metric=False))
     text = page_of(tmp_path / "out").text
     assert "0.03 map units" in text and "over 0.5 map units or 5°" in text
     assert not re.search(r"\d\s(m|metres)\b", text)
-    assert report._scale(run).axes[0].get_ylabel() == "map units per odometry unit"
-    assert report._error(run).axes[0].get_ylabel() == "position (map units)"
-    assert report._top_view(run).axes[0].get_xlabel().endswith("of the map (map units)")
+    assert report_pictures._scale(run).axes[0].get_ylabel() == "map units per odometry unit"
+    assert report_pictures._error(run).axes[0].get_ylabel() == "position (map units)"
+    assert report_pictures._top_view(run).axes[0].get_xlabel().endswith("of the map (map units)")
 
 
 def test_a_stamp_that_goes_backwards_does_not_turn_time_back():
     steps, *rest = a_run([L] * 6)
     steps[3] = dataclasses.replace(steps[3], stamp_ns=START_NS - 10**15)
-    run = report._Run(steps, *rest, a_map())
+    run = report_run.Run(steps, *rest, a_map())
     np.testing.assert_allclose(run.time, [0, 0.5, 1, 1, 2, 2.5])
     assert list(run.spans()) == [(L, 0.0, 2.5)]
 
@@ -314,7 +314,7 @@ def test_odometry_of_refused_input_is_not_drawn():
     refused = Rejection(4, 0, steps[4].stamp_ns, "bad_pose", "not finite")
     steps[4] = dataclasses.replace(steps[4], anchor=None, correction=None, rejection=refused)
     odometry[4] = broken
-    run = report._Run(steps, step_s, odometry, truth, a_map())
+    run = report_run.Run(steps, step_s, odometry, truth, a_map())
     assert run.odometry[4] is None and len(run.fits) == 1
     np.testing.assert_allclose(run.fits[0][1].s, 2.0)
 
@@ -325,7 +325,7 @@ def test_each_session_is_fitted_by_itself():
     steps, step_s, odometry, truth = (
         list(a) + list(b) for a, b in zip(parts[0], (*parts[1][:2], far, parts[1][3]), strict=True)
     )
-    for mine, S in report._Run(steps, step_s, odometry, truth, a_map()).fits:
+    for mine, S in report_run.Run(steps, step_s, odometry, truth, a_map()).fits:
         x = np.array([o.t for o, m in zip(odometry, mine, strict=True) if m])
         np.testing.assert_allclose(
             S.apply(x), np.array([t.t for t, m in zip(truth, mine, strict=True) if m]), atol=1e-9
@@ -339,17 +339,17 @@ def test_top_view_names_what_it_shows():
     everything = {"map points", "map keyframes", "truth", "odometry, fitted", "corrected", "corrected, COASTING"}
     everything |= {"LOST, not published", "anchor, accepted", "anchor, rejected", "first pose"}
     run = a_run()
-    assert set(texts(report._top_view(report._Run(*run, a_map())))) == everything
+    assert set(texts(report_pictures._top_view(report_run.Run(*run, a_map())))) == everything
     calm = a_run([L] * 8)
-    assert set(texts(report._top_view(report._Run(*calm[:3], None, a_map())))) == {
+    assert set(texts(report_pictures._top_view(report_run.Run(*calm[:3], None, a_map())))) == {
         "map points", "map keyframes", "odometry, fitted", "corrected", "anchor, accepted", "first pose",
     }  # fmt: skip
 
 
 @pytest.mark.parametrize("draw", [draw for draw, _ in report.PICTURES.values()])
 def test_the_legend_covers_no_data_and_nothing_leaves_the_picture(draw):
-    with matplotlib.rc_context(dict(item.split("=") for item in report.STYLE.split())):
-        figure = draw(report._Run(*a_run(), a_map()))
+    with matplotlib.rc_context(dict(item.split("=") for item in report_pictures.STYLE.split())):
+        figure = draw(report_run.Run(*a_run(), a_map()))
         figure.draw_without_rendering()
     legend = figure.legends[0].get_window_extent()
     for ax in figure.axes:
@@ -366,30 +366,30 @@ def test_odometry_that_leads_anywhere_does_not_shrink_the_rest():
     steps, step_s, odometry, _ = a_run()
     wild = [s if n in (5, 6) else dataclasses.replace(s, correction=None) for n, s in enumerate(steps)]
     far = [SE3(o.R, o.t * (1 if n in (5, 6) else 1e4)) for n, o in enumerate(odometry)]
-    ax = report._top_view(report._Run(wild, step_s, far, None, a_map())).axes[0]
+    ax = report_pictures._top_view(report_run.Run(wild, step_s, far, None, a_map())).axes[0]
     assert np.ptp(ax.get_xlim()) < 20 and np.ptp(ax.get_ylim()) < 20
 
 
 def test_reasons_have_a_row_each_and_none_where_nothing_was_rejected():
-    *_, rows = report._anchors(report._Run(*a_run(), a_map())).axes
+    *_, rows = report_pictures._anchors(report_run.Run(*a_run(), a_map())).axes
     assert [
         t.get_text() for t in rows.get_yticklabels()
     ] == "too few matches|too few inliers|inconsistent|bad pixel".split("|")
-    assert [line.get_color() for line in rows.lines] == [report.RED] * 3 + [report.INK]
+    assert [line.get_color() for line in rows.lines] == [report_pictures.RED] * 3 + [report_pictures.INK]
     assert [len(line.get_xdata()) for line in rows.lines] == [1, 5, 2, 4]
-    assert len(report._anchors(report._Run(*a_run([L] * 5), a_map())).axes) == 2
+    assert len(report_pictures._anchors(report_run.Run(*a_run([L] * 5), a_map())).axes) == 2
 
 
 def test_one_slow_step_does_not_flatten_the_others():
     steps, step_s, odometry, truth = a_run()
-    ax = report._step_time(report._Run(steps, step_s, odometry, truth, a_map())).axes[0]
+    ax = report_pictures._step_time(report_run.Run(steps, step_s, odometry, truth, a_map())).axes[0]
     assert ax.get_yscale() == "linear" and ax.get_ylim()[0] == 0
-    ax = report._step_time(report._Run(steps, [1.0, *step_s[1:]], odometry, truth, a_map())).axes[0]
+    ax = report_pictures._step_time(report_run.Run(steps, [1.0, *step_s[1:]], odometry, truth, a_map())).axes[0]
     assert ax.get_yscale() == "log" and 1 < ax.get_ylim()[0] < 4 and ax.get_ylim()[1] > 1000
 
 
 def test_states_shade_the_background():
-    figure = report._scale(report._Run(*a_run(), a_map()))
+    figure = report_pictures._scale(report_run.Run(*a_run(), a_map()))
     shades = {p.get_label(): p for p in figure.axes[0].patches if not p.get_label().startswith("_")}
     assert {"UNINITIALIZED", "CANDIDATE", "COASTING", "LOST"} <= set(shades)
     lost = shades["LOST"].get_extents().transformed(figure.axes[0].transData.inverted())
@@ -402,7 +402,7 @@ def test_plane_of_a_level_run_is_seen_from_above(optical):
     turn = LEVEL.inverse() if optical else SE3.identity()
     rng = np.random.default_rng(0)
     path = turn.apply(rng.normal(size=(50, 3)) * [5, 1, 0.01])
-    axes, view = report._plane(path, a_map(look=turn @ LEVEL), np.zeros((0, 3)))
+    axes, view = report_run.plane(path, a_map(look=turn @ LEVEL), np.zeros((0, 3)))
     up = turn.R[:, 2]
     assert view == ", seen from above"
     np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-12)
@@ -411,13 +411,13 @@ def test_plane_of_a_level_run_is_seen_from_above(optical):
 
 def test_plane_of_a_climb_has_up_upwards_and_is_not_called_a_top_view():
     path = np.random.default_rng(0).normal(size=(50, 3)) * [5, 0.01, 2]
-    axes, view = report._plane(path, a_map(), np.zeros((0, 3)))
+    axes, view = report_run.plane(path, a_map(), np.zeros((0, 3)))
     assert view == "" and axes[1][2] > 0.95
 
 
 def test_plane_of_a_straight_line_is_that_of_the_map():
     path, rng = np.c_[np.arange(9.0), np.zeros((9, 2))], np.random.default_rng(1)
-    axes, _ = report._plane(path, a_map(), rng.normal(size=(500, 3)) * [9, 3, 1])
+    axes, _ = report_run.plane(path, a_map(), rng.normal(size=(500, 3)) * [9, 3, 1])
     np.testing.assert_allclose(np.abs(axes), [[1, 0, 0], [0, 1, 0]], atol=0.1)
 
 
@@ -431,7 +431,7 @@ def test_plane_of_a_straight_line_is_that_of_the_map():
     ],
 )
 def test_direction(axis, words):
-    assert report._direction(np.array(axis, float)) == words
+    assert report_run.direction(np.array(axis, float)) == words
 
 
 # -- the folder ------------------------------------------------------------------------------------------------------
@@ -498,7 +498,7 @@ def test_nothing_half_written(tmp_path, quick, monkeypatch, there, broken):
 
     rename = Path.rename
     if broken == "drawing":
-        monkeypatch.setattr(report, "_draw", fails)
+        monkeypatch.setattr(report, "draw_all", fails)
         with pytest.raises(RuntimeError):
             write(tmp_path / "out", title="second")
     else:

@@ -21,11 +21,12 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from xalign_ros.apps.node_parameters import declare_parameters, refuse_unknown, told_as
@@ -41,6 +42,7 @@ from xalign_ros.io.step_messages import KEYFRAME_QUEUE, TOPICS, step_messages
 from xalign_ros.io.xmap import read_map
 
 BEAT_S = 1.0  # between two `state` messages at most
+LOOK_S = 0.2  # between two looks for a signal at most
 WARN_S = 5.0  # between two warnings of one kind at least
 UNKNOWN = float("nan")
 
@@ -48,9 +50,9 @@ UNKNOWN = float("nan")
 class Worker(threading.Thread):
     """Does jobs in order of arrival, and `beat` once a second; KEYFRAME_QUEUE jobs wait at most, the newest ones."""
 
-    def __init__(self, work: Callable[[bytes], None], beat: Callable[[], None], failed: Callable[[], None]) -> None:
+    def __init__(self, work: Callable[[bytes], None], beat: Callable[[], None]) -> None:
         super().__init__(name="aligner", daemon=True)
-        self._work, self._beat, self._failed = work, beat, failed
+        self._work, self._beat = work, beat
         self._waiting: deque[bytes] = deque()
         self._changed = threading.Condition()
         self._stopping = False
@@ -88,7 +90,6 @@ class Worker(threading.Thread):
                     due = time.monotonic() + BEAT_S
         except Exception:  # nobody else would notice
             self.error = traceback.format_exc()
-            self._failed()
 
     def _next(self, due: float) -> bytes | None:
         with self._changed:
@@ -101,7 +102,7 @@ class XalignNode(Node):
 
     def __init__(self) -> None:
         super().__init__("xalign")
-        self.worker = Worker(self._take, self._beat, self._give_up)
+        self.worker = Worker(self._take, self._beat)
         self._odom_frame = "odom"
         self._refused: Counter[str] = Counter()
 
@@ -201,7 +202,7 @@ class XalignNode(Node):
             self._answer = None
         frames = {"map_frame": self._map_frame, "odom_frame": self._odom_frame}
         for topic, message in step_messages(ros_types, step, self._map, T_base_cam=self._T_base_cam, **frames).items():
-            self._publish(topic, message)
+            self._outputs[topic].publish(message)
         if step.rejection is not None and step.rejection.reason in INPUT_REASONS:
             self._refuse(step.rejection.reason, f"keyframe {step.keyframe_id}: {step.rejection.detail}")
         if step.state.state != self._state.state:
@@ -211,24 +212,13 @@ class XalignNode(Node):
     def _beat(self) -> None:
         m = self._map
         message = state_message(ros_types, self._state, self._map_frame, self._odom_frame, m.map_id, m.version)
-        self._publish("state", message)
-
-    def _publish(self, topic: str, message: Any) -> None:
-        try:
-            self._outputs[topic].publish(message)
-        except RuntimeError:
-            if self.context.ok():
-                raise
+        self._outputs["state"].publish(message)
 
     def _refuse(self, reason: str, detail: str) -> None:
         self._refused[reason] += 1
         counts = ", ".join(f"{name} {n}" for name, n in self._refused.items())
         told = f"refused as {reason}: {detail} (so far {counts})"
         self.get_logger().warning(told, throttle_duration_sec=WARN_S)
-
-    def _give_up(self) -> None:
-        self.get_logger().fatal(f"the worker failed\n{self.worker.error}")
-        self.context.try_shutdown()
 
 
 def newest(keyframe: Keyframe, c: Correction) -> Solution:
@@ -243,30 +233,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="xalign_node", description=__doc__, usage="%(prog)s --ros-args -p map:=MAP ..."
     )
-    node = None
-    # rclpy shuts down its context on SIGINT and then calls this, in place of a KeyboardInterrupt amid the tidying up.
-    before = signal.signal(signal.SIGINT, lambda *_: None)
+    node, signals = None, []
+    # Not rclpy's own handlers: they take the context from under a step that is going on, and answer one signal only.
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, lambda number, _: signals.append(number))
     try:
         with told_as("the arguments cannot be used"):
             parser.parse_args(remove_ros_args(words))
-            rclpy.init(args=words)
+            rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
             node = XalignNode()
         node.configure()
         node.start()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        executor.spin()
+        while not signals and not node.worker.error:
+            executor.spin_once(timeout_sec=LOOK_S)
     except XalignError as error:
         print(f"xalign_node: {error}", file=sys.stderr)
         return 1
-    except ExternalShutdownException:
-        pass
     finally:
         if node is not None:
             node.stop()
         rclpy.try_shutdown()
-        signal.signal(signal.SIGINT, before)
-    return 1 if node is None or node.worker.error else 0
+        for ending in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(ending, signal.SIG_IGN)  # the interpreter's last moments are open to them otherwise
+    if node.worker.error:
+        print(f"xalign_node: the worker failed\n{node.worker.error}", file=sys.stderr)
+    return 1 if node.worker.error else 0
 
 
 if __name__ == "__main__":

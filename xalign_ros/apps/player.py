@@ -37,7 +37,7 @@ from xalign_ros.io.messages import (
 )
 from xalign_ros.io.odometry_message import ODOMETRY
 from xalign_ros.io.ros_fields import ros_types, stamp_of
-from xalign_ros.io.run_output import OutputLog, Run, in_words, read_truth, remark, write_results
+from xalign_ros.io.run_output import OutputLog, Run, check_report, in_words, read_truth, remark, write_results
 from xalign_ros.io.step_messages import KEYFRAME_QUEUE, TOPICS
 from xalign_ros.io.xmap import read_map
 
@@ -90,6 +90,8 @@ class Player(Node):
                 self._take_state(message)
             else:
                 self._received[topic].append(message)
+            if len(self._received["anchors"]) > len(self._sent):
+                raise XalignError("more anchors than keyframes come back: is there another node, or another source?")
 
         durability = DurabilityPolicy.TRANSIENT_LOCAL if topic == "state" else DurabilityPolicy.VOLATILE
         return self.create_subscription(
@@ -137,8 +139,6 @@ class Player(Node):
         for end in self._subscribed:
             if not end.get_publisher_count():
                 return f"nobody publishes {end.topic_name} (reliably)"
-        if self._subscribed[-1].get_publisher_count() > 1:
-            raise XalignError(f"several nodes publish {self._subscribed[-1].topic_name}; stop all but one")
         return "" if self._received["state"] else f"nothing came on {self._subscribed[-1].topic_name}"
 
     def play(self, log: Log, topic: str, rate: float) -> None:
@@ -267,6 +267,7 @@ def player_in_graph() -> Iterator[Player]:
 
 def run(args: argparse.Namespace) -> None:
     """Raises XalignError on bad input and when the node does not play along; what it has written by then is gone."""
+    check_report(args.report, [args.log, args.map, args.truth, args.output, args.trajectory])
     if args.config or args.set:
         raise ConfigError("with --live the options are the node's parameters: give --config and --set to the node")
     if not (args.rate >= 0 and math.isfinite(args.rate)):

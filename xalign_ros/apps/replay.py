@@ -13,7 +13,7 @@ from xalign_ros.core.aligner import Aligner
 from xalign_ros.io.config_file import read_config
 from xalign_ros.io.log import Log, typestore
 from xalign_ros.io.messages import correction_digest, correction_fields
-from xalign_ros.io.run_output import OutputLog, Run, in_words, read_truth, remark, write_results
+from xalign_ros.io.run_output import OutputLog, Run, check_report, in_words, read_truth, remark, write_results
 from xalign_ros.io.step_messages import step_messages
 from xalign_ros.io.xmap import read_map
 
@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Raises XalignError on bad input; what it has written by then is gone."""
+    check_report(args.report, [args.log, args.map, args.truth, args.config, args.output, args.trajectory])
     config = read_config(args.config, args.set)
     map_ = read_map(args.map, verify=True)
     truth = read_truth(args.truth)

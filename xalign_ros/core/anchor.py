@@ -36,7 +36,7 @@ def find_guided(
     camera = _camera(keyframe)
     sigma_px = float(np.median(_sigma_px(keyframe, index, config)))
     matches = guided_matches(keyframe.features, camera, index, T_map_cam, cov_cam, sigma_px, config.matching)
-    found = _pose(keyframe, index, matches, config)
+    found = _pose(keyframe, index, matches, config, T_map_cam)
     return _result(keyframe, index, matches, found, 0.0, config)
 
 
@@ -68,7 +68,9 @@ def _sigma_px(keyframe: Keyframe, index: MapIndex, config: Config) -> Array:
     return np.maximum(sigma, index.map.sigma_px)
 
 
-def _pose(keyframe: Keyframe, index: MapIndex, matches: Matches, config: Config) -> Pose | str:
+def _pose(
+    keyframe: Keyframe, index: MapIndex, matches: Matches, config: Config, start: SE3 | None = None
+) -> Pose | str:
     map_ = index.map
     sigma = _sigma_px(keyframe, index, config)
     pairs = Points2D3D(
@@ -77,7 +79,7 @@ def _pose(keyframe: Keyframe, index: MapIndex, matches: Matches, config: Config)
         map_.points[matches.point],
         map_.point_cov[matches.point].astype(float),
     )
-    return estimate_pose(pairs, _camera(keyframe), seed_of(keyframe), config.pnp)
+    return estimate_pose(pairs, _camera(keyframe), seed_of(keyframe), config.pnp, start)
 
 
 def _inliers(pose: Pose | str) -> int:

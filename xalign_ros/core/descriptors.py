@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from xalign_ros.core.lie import Array
 from xalign_ros.core.records import Norm
+
+CACHED = 1 << 16  # distances computed at a time
 
 
 def pair_distance(a: np.ndarray, b: np.ndarray, norm: Norm) -> Array:
@@ -29,10 +30,27 @@ def nearest(query: np.ndarray, train: np.ndarray, norm: Norm, count: int) -> tup
         return index, d * d / 2
     if norm is not Norm.HAMMING:
         return _nearest_l2(query.astype(np.float32), train.astype(np.float32), count)
-    found = cv2.batchDistance(
-        np.ascontiguousarray(query), np.ascontiguousarray(train), cv2.CV_32S, normType=cv2.NORM_HAMMING, K=count
-    )
-    return found[1].reshape(len(query), -1).astype(np.int64), found[0].reshape(len(query), -1).astype(float)
+    return _nearest_hamming(query, train, count)
+
+
+def _nearest_hamming(query: np.ndarray, train: np.ndarray, count: int) -> tuple[np.ndarray, Array]:
+    """XOR and population count, a machine word at a time, over blocks that stay in the processor's cache."""
+    words, columns = _words(query), np.ascontiguousarray(_words(train).T)
+    block = max(1, CACHED // max(len(train), 1))
+    index = np.empty((len(query), count), np.int64)
+    distance = np.empty((len(query), count))
+    for start in range(0, len(query), block):
+        q = words[start : start + block]
+        d = np.zeros((len(q), len(train)), np.uint16)
+        for n, column in enumerate(columns):
+            d += np.bitwise_count(column ^ q[:, n, None])
+        rows = np.arange(len(q))
+        for k in range(count):
+            best = d.argmin(axis=1)
+            index[start : start + block, k] = best
+            distance[start : start + block, k] = d[rows, best]
+            d[rows, best] = np.iinfo(np.uint16).max
+    return index, distance
 
 
 def _nearest_l2(query: np.ndarray, train: np.ndarray, count: int) -> tuple[np.ndarray, Array]:

@@ -59,6 +59,18 @@ def read_truth(path: Path | None) -> Trajectory | None:
     return truth
 
 
+def check_report(report: Path | None, files: Sequence[Path | None]) -> None:
+    """FormatError where the report could not be written at the end, or would replace one of the run's own files."""
+    if report is None:
+        return
+    from xalign_ros.io.report import check_report_folder  # its plotting library takes a second to import
+
+    check_report_folder(report)
+    for path in files:
+        if path is not None and report.resolve() in (path.resolve(), *path.resolve().parents):
+            raise FormatError(f"{path} lies in the report folder {report}, which is replaced; give the report another")
+
+
 def write_results(
     run: Run,
     digest: str,
@@ -77,7 +89,7 @@ def write_results(
     if trajectory:
         write_tum(trajectory, _trajectory(run.steps))
     if report:
-        from xalign_ros.io.report import write_report  # its plotting library takes a second to import
+        from xalign_ros.io.report import write_report
 
         write_report(report, result, run.steps, run.step_s, run.odometry, true, map_, title=title)
     return result
