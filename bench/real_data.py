@@ -28,7 +28,8 @@ def data_dir() -> Path:
 
 def maplab(name: str, metric: bool) -> Posed:
     """tango_loop or anymal: keyframes with their binary descriptors and track ids."""
-    d = np.load(data_dir() / name / "keyframes.npz")
+    with np.load(data_dir() / name / "keyframes.npz") as packed:
+        d = dict(packed)  # each access to the packed file would unpack the array again
     model = "fov" if "FOV" in str(d["model"]) else "equidistant"
     camera = Camera(model, d["K"], d["D"], *(int(x) for x in d["wh"]))
     T_body_cam = SE3.from_matrix(d["T_B_C"])
