@@ -10,11 +10,14 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 pytest.importorskip("xalign_msgs.msg", reason="xalign_msgs is not compiled")
 
 import live
+import rclpy
 from live_world import BETWEEN, FAULTS, LiveWorld, odometry_between, spoiled
 from rclpy.serialization import serialize_message
+from rclpy.signals import SignalHandlerOptions
 
-from xalign_ros.apps.node import Worker
+from xalign_ros.apps.node import Worker, XalignNode
 from xalign_ros.apps.node_parameters import OWN_PARAMETERS, declare_parameters
+from xalign_ros.core.aligner import Aligner
 from xalign_ros.core.config import Config, options
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io import ros_fields as ros
@@ -171,6 +174,26 @@ def test_malformed_messages_are_refused_and_the_run_goes_on(world, tmp_path):
         assert node.end() == 0
 
 
+def test_step_that_fails_begins_anew(world, monkeypatch):
+    def fail(*_):
+        raise ArithmeticError("of the test")
+
+    first, second = (bytes(serialize_message(keyframe_message(ros_types, k))) for k in world.run.keyframes[:2])
+    rclpy.init(args=["--ros-args", "-p", f"map:={world.map}"], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = XalignNode()
+        node.configure()
+        with monkeypatch.context() as m:
+            m.setattr(Aligner, "step", fail)
+            node._take(first)
+        assert (node._state.keyframes, node._state.reason) == (0, "a step failed")
+        node._take(second)
+        assert node._state.keyframes == 1
+        node.stop()
+    finally:
+        rclpy.shutdown()
+
+
 def test_flood_drops_the_oldest_and_answers_the_newest(world, tmp_path):
     with live.node(tmp_path, world.map) as node, live.observer(anchors=TOPICS["anchors"]) as me:
         send = me.sender("keyframes", KEYFRAME)
@@ -186,6 +209,7 @@ def test_flood_drops_the_oldest_and_answers_the_newest(world, tmp_path):
         assert "dropped so far" in node.words()
 
 
+@pytest.mark.slow
 def test_odometry_is_corrected_at_its_own_rate_while_steps_run(world, tmp_path):
     T_base_cam = [0.1, 0.0, 0.2, 0.5, -0.5, 0.5, -0.5]
     arguments = ["-p", f"base_from_cam:={T_base_cam}", "-p", "base_frame:=robot"]

@@ -519,6 +519,47 @@ def test_a_metric_odometry_can_lock_standing_still(evidence):
     assert not any(s.correction for s in evidence(free))
 
 
+@pytest.mark.parametrize("leap", [1e3, 1e8, 1e40])
+@pytest.mark.parametrize("back", [True, False], ids=["there and back", "for good"])
+def test_an_odometry_that_leaps_is_survived(evidence, leap, back):
+    """One keyframe or all that follow are elsewhere: no pose is published on such a way, and the lock is found again."""
+    drive = Drive(50, 1)
+    away = SE3(np.eye(3), [leap, 0, 0])
+    for n in range(20, 21 if back else 50):
+        k = drive.keyframes[n]
+        drive.keyframes[n] = replace(k, T_odom_cam=away @ k.T_odom_cam)
+    steps = evidence(drive)
+    error = position_errors(steps, drive.truth)
+    assert np.nanmax(error) < 0.15
+    assert np.isnan(error[20])
+    assert back or leap > 1e12 or np.isfinite(error[30:]).all()  # beyond 1e12 a metre is lost in the rounding
+    assert not back or np.isfinite(error[30:]).all()
+
+
+def test_a_break_that_looks_like_drift_is_followed_after_the_cap(evidence):
+    """Some metres, for good: eight anchors that disagree might be a look-alike, the ninth decides for them."""
+    drive = Drive(50, 1)
+    for n in range(20, 50):
+        k = drive.keyframes[n]
+        drive.keyframes[n] = replace(k, T_odom_cam=SE3(np.eye(3), [12.0, 0, 0]) @ k.T_odom_cam)
+    steps = evidence(drive)
+    error = position_errors(steps, drive.truth)
+    assert np.nanmax(error[:20]) < 0.15 and error[20] > 1
+    assert {s.rejection.reason for s in steps[20 : 20 + CAP]} == {"drift_budget"}
+    assert np.nanmax(error[20 + CAP + 1 :]) < 0.15 and np.isfinite(error).sum() == 48
+
+
+def test_an_odometry_that_diverges_ends_lost_and_not_in_an_exception(evidence):
+    drive = Drive(60, 1)
+    for n in range(20, 60):
+        k = drive.keyframes[n]
+        drive.keyframes[n] = replace(k, T_odom_cam=SE3(k.T_odom_cam.R, k.T_odom_cam.t + 5.0 ** (n - 19)))
+    steps = evidence(drive, [a if n < 20 else None for n, a in enumerate(drive.anchors)])
+    assert all(s.correction is None for s in steps[23:])
+    assert {s.state.state for s in steps[23:]} <= {State.LOST, State.CANDIDATE}
+    assert not any(s.state.localized for s in steps[23:])
+
+
 # The same input gives the same numbers ------------------------------------------------------------------------------
 
 

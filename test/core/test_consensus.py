@@ -178,3 +178,16 @@ def test_drift_beyond_it_is_disagreement():
     broken = [Witness(w.anchor, jump @ w.T_odom_cam if n > 3 else w.T_odom_cam, w.path) for n, w in enumerate(found)]
     members = find_consensus(broken, False, CONFIG).members
     assert set(members) >= {4, 5, 6, 7} and not set(members) & {0, 1, 2}
+
+
+@pytest.mark.parametrize("leap", [1e2, 1e4, 1e8])
+def test_a_witness_that_the_odometry_leaves_open_is_none(leap):
+    """Two that agree, and one from whose keyframe the odometry leapt there and back: its drift would excuse anything."""
+    found = witnesses_of([*POSES[:2], POSES[4]])
+    away = SE3(found[0].T_odom_cam.R, found[0].T_odom_cam.t + np.array([leap, 0, 0]))
+    leapt = [
+        Witness(found[0].anchor, away, 0.0),
+        *(Witness(w.anchor, w.T_odom_cam, leap + w.path) for w in found[1:]),
+    ]
+    assert find_consensus(leapt, False, CONFIG) is None
+    assert find_consensus(found, False, CONFIG).members == (0, 1, 2)

@@ -9,6 +9,7 @@ import worlds
 from xalign_ros.core.aligner import Aligner
 from xalign_ros.core.anchor import find_anywhere, find_guided
 from xalign_ros.core.config import Config, with_options
+from xalign_ros.core.map_building import build_map
 from xalign_ros.core.records import (
     ANCHOR_REASONS,
     FEATURE_REASONS,
@@ -69,6 +70,41 @@ def test_good_features_are_an_anchor(world, index, run):
         e = (found.T_map_cam.inverse() @ T).log()
         assert e @ np.linalg.solve(found.cov_cam, e) < 25
         assert 0.3 < found.rms_px < 2 and 0 <= found.runner_up <= CONFIG.pnp.max_runner_up
+
+
+def in_norm(features, norm):
+    """The same codes as a vector of bits, in whatever a descriptor of this norm is made of."""
+    bits = np.unpackbits(features.descriptors, axis=1)
+    values = {
+        Norm.HAMMING: features.descriptors,
+        Norm.L2_UINT8: 200 * bits,
+        Norm.L2_FLOAT32: bits / 16,
+        Norm.COSINE_FLOAT32: 5.0 * (2.0 * bits - 1),
+    }[norm]
+    f = features
+    return Features(f.uv, values, f.name, norm, f.sigma_px, f.track_ids)
+
+
+@pytest.mark.parametrize("norm", list(Norm), ids=lambda n: n.name)
+def test_an_anchor_is_found_with_descriptors_of_any_norm(world, norm):
+    """From map building to pose; the same landmarks in four kinds of descriptor."""
+    poses = worlds.along_line(16, 0.5)
+    rng = np.random.default_rng(4)
+    seen = [in_norm(worlds.seen_from(world.points, world.codes, T, rng, ids=0), norm) for T in poses]
+    keyframes = [Keyframe(n, 0, n, T, worlds.CAMERA, f) for n, (T, f) in enumerate(zip(poses, seen, strict=True))]
+    index = MapIndex(build_map(keyframes, poses, map_id="m", source="test", metric=True))
+    T = worlds.along_line(8, 0.5, 0.2)[-1]
+    k = Keyframe(0, 1, 1, T, worlds.CAMERA, in_norm(worlds.features_at(world, T, (3,)), norm))
+    for found in (find_anywhere(k, index, CONFIG), find_guided(k, index, T, TIGHT, CONFIG)):
+        assert isinstance(found, Anchor) and found.inliers > 90
+        assert np.linalg.norm(found.T_map_cam.t - T.t) < 0.03
+    step = Aligner(index.map).step(k)
+    assert step.rejection.reason == "inconsistent"
+    if norm.dtype is np.float32:
+        broken = np.array(k.features.descriptors)
+        broken[3, 3] = np.nan
+        bad = replace(k, features=replace(k.features, descriptors=broken))
+        assert Aligner(index.map).step(bad).rejection.reason == "bad_descriptor"
 
 
 def scene_of_one_line():

@@ -210,6 +210,20 @@ def test_far_behind_the_last_anchor_the_window_still_stands():
     assert (np.diff(sigmas[10:]) > 0).all() and sigmas[-1] > 200
 
 
+def test_numbers_that_allow_no_solution_are_no_exception():
+    """An edge of 1e60 m: None, so that who asked can begin anew."""
+    keyframes = keyframes_of([SE3(np.eye(3), [0, 0, z]) for z in (0, 1, 1e60)])
+    window = Window(Sim3(np.eye(3), np.zeros(3), 1.0), 10, False, CONFIG)
+    rng = np.random.default_rng(15)
+    found = []
+    for n, keyframe in enumerate(keyframes):
+        if n:
+            window.extend(edge_between(keyframes[n - 1], keyframe, 1.0, CONFIG.odometry))
+        window.attach(anchor_at(SE3(np.eye(3), [0, 0, n]), n, rng))
+        found.append(window.solve())
+    assert found[0] is not None and found[1] is not None and found[2] is None
+
+
 def test_standing_still_is_no_error():
     """Edges of no length, anchors at one spot: the position is known, the scale is not."""
     rng = np.random.default_rng(14)
@@ -276,6 +290,12 @@ def test_edge_noise_by_hand():
 def test_an_edge_of_no_length_has_noise():
     edge = edge_between(*two_keyframes(0.0), 1.0, Odometry())
     assert (edge.sigmas > 0).all()
+
+
+def test_a_covariance_that_is_no_number_is_unknown():
+    i, j = two_keyframes(4.0, cov_cam=np.full((6, 6), np.nan))
+    want = edge_between(*two_keyframes(4.0), 1.0, Odometry()).sigmas
+    np.testing.assert_array_equal(edge_between(i, j, 1.0, Odometry()).sigmas, want)
 
 
 def marginals(truth, Q):

@@ -48,10 +48,26 @@ def run(args: argparse.Namespace) -> None:
         _write_mapping(work, data, camera)
         _write_run(work, data, camera)
         commands = [
-            ["map", "build", "--log", work / "mapping.mcap", "--poses", work / "mapping.tum", "-o", work / "street.xmap"],
+            [
+                "map",
+                "build",
+                "--log",
+                work / "mapping.mcap",
+                "--poses",
+                work / "mapping.tum",
+                "-o",
+                work / "street.xmap",
+            ],
             ["replay", work / "run.mcap", "--map", work / "street.xmap", "--truth", work / "truth.tum"],
         ]
-        commands[1] += ["-o", work / "corrections.mcap", "--trajectory", work / "corrected.tum", "--report", args.output]
+        commands[1] += [
+            "-o",
+            work / "corrections.mcap",
+            "--trajectory",
+            work / "corrected.tum",
+            "--report",
+            args.output,
+        ]
         for command in commands:
             words = [str(w) for w in command]
             print("$ xalign " + " ".join(w.replace(f"{work}/", "") for w in words), file=sys.stderr)

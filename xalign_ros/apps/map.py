@@ -62,14 +62,18 @@ def _build(args: argparse.Namespace) -> None:
 def _from_log(args: argparse.Namespace) -> ReferenceMap:
     if args.poses is None:
         raise MapError("--log needs --poses with the T_map_cam of its keyframes")
-    if args.scale is not None or args.align is not None:
-        raise MapError("--scale and --align are for --colmap; a log's map is in the metres of its --poses")
+    if (args.scale, args.align, args.database) != (None, None, None):
+        raise MapError("--scale, --align and --database are for --colmap; a log's map is in the metres of its --poses")
     keyframes, poses = posed_keyframes(args.log, args.poses, args.keyframe_topic)
     source = f"log {args.log.name}, poses {args.poses.name}"
     return build_map(keyframes, poses, map_id=args.output.stem, source=source, metric=True)
 
 
 def _from_colmap(args: argparse.Namespace) -> ReferenceMap:
+    if args.poses is not None or args.keyframe_topic is not None:
+        raise MapError(
+            "--poses and --keyframe-topic are for --log; a COLMAP model is made metric by --scale or --align"
+        )
     if args.database is None:
         raise MapError("--colmap needs --database, where COLMAP keeps the descriptors")
     model = read_colmap_reconstruction(args.colmap, args.database)

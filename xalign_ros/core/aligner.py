@@ -32,6 +32,8 @@ from xalign_ros.core.window import Window
 
 LOCK_UPDATES = 3  # smoother updates until a window that starts from a consensus has settled
 
+WAITS = "it waits for others that agree with it"
+
 Prediction = tuple[Sim3, Array]  # S_map_i and its covariance (7, 7)
 
 
@@ -89,6 +91,8 @@ class Aligner:
             if isinstance(found, Anchor):
                 self._window.attach(found)
             self._solution = self._window.solve()
+            if self._solution is None:
+                found = self._give_up(found)
         found, believed = self._challenge(found)
         if isinstance(found, Anchor):
             self._links[-1].accepted = True
@@ -121,7 +125,7 @@ class Aligner:
             return found
         self._links[-1].anchor = found
         if predicted is None or self._judged(pose_covariance(*predicted))[0] is State.LOST:
-            return _refused(found, "inconsistent", "it waits for others that agree with it")
+            return _refused(found, "inconsistent", WAITS)
         S, cov = predicted
         error = (found.T_map_cam.inverse() @ S.rigid_pose()).log()
         chi2 = float(error @ np.linalg.solve(pose_covariance(S, cov) + found.cov_cam, error))
@@ -131,6 +135,12 @@ class Aligner:
         return _refused(
             found, "drift_budget", f"it is {off:.2f} m off the prediction: {chi2:.0f} > {self.config.lock.chi2:g}"
         )
+
+    def _give_up(self, found: Anchor | Rejection) -> Anchor | Rejection:
+        """Go on without a window where the odometry has leapt further than numbers reach; an anchor waits for others."""
+        self._window = self._anchored = None
+        self._unlocked = State.LOST, "the odometry leapt further than the window can follow"
+        return _refused(found, "inconsistent", WAITS) if isinstance(found, Anchor) else found
 
     def _challenge(self, found: Anchor | Rejection) -> tuple[Anchor | Rejection, tuple[Anchor, ...]]:
         """Lock, or lock anew, when the anchors not believed so far agree and outnumber those that were.
@@ -168,7 +178,7 @@ class Aligner:
             if link.anchor is not None and id(link) in member:
                 window.attach(link.anchor)
         solution = window.solve(LOCK_UPDATES)
-        if np.sqrt(solution.cov[6, 6]) > self.config.lock.scale_sigma:
+        if solution is None or np.sqrt(solution.cov[6, 6]) > self.config.lock.scale_sigma:
             return False
         for link in self._links:
             link.accepted = id(link) in member

@@ -14,6 +14,7 @@ from xalign_ros.core.transforms import SE3, Sim3
 
 SCALE_BASELINE_SIGMAS = 3.0  # of two anchors, below which their distance says nothing about scale
 SCALE_RANGE = (1e-3, 1e3)
+VAGUE_M, VAGUE_RATIO = 0.5, 0.5  # of sigma and of distance: an odometry that says less about a witness agrees with any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,13 +44,14 @@ def find_consensus(witnesses: Sequence[Witness], metric: bool, config: Config) -
     if len(witnesses) < config.lock.anchors:
         return None
     newest = len(witnesses) - 1
+    evidence = _Evidence.of(witnesses)
     best: tuple[int, float, Sim3, tuple[int, ...]] | None = None
     for other in range(newest):
         hypothesis = _similarity(witnesses[other], witnesses[newest], metric)
         if hypothesis is None:
             continue
         S, scale_sigma = hypothesis
-        chi2 = np.array([_chi2(S, scale_sigma, w, witnesses[newest], config) for w in witnesses])
+        chi2 = _chi2(S, scale_sigma, evidence, config)
         members = tuple(int(n) for n in np.flatnonzero(chi2 < config.lock.chi2))
         score = (len(members), -float(chi2[list(members)].sum()))
         if newest in members and (best is None or score > best[:2]):
@@ -79,20 +81,50 @@ def _similarity(a: Witness, b: Witness, metric: bool) -> tuple[Sim3, float] | No
     return Sim3(R, middle_map - scale * R @ middle_odom, scale), scale_sigma
 
 
-def _chi2(S: Sim3, scale_sigma: float, w: Witness, origin: Witness, config: Config) -> float:
-    """Squared Mahalanobis length of the witness' 6 residuals under S."""
-    predicted = (S @ w.T_odom_cam).rigid_pose()
-    T = w.anchor.T_map_cam.inverse() @ predicted
-    r = se3_log(T.R, T.t)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """N witnesses as arrays: rotations (N, 3, 3), positions (N, 3), covariances (N, 6, 6), path (N,)."""
+
+    R_map_cam: Array
+    t_map_cam: Array
+    cov: Array
+    R_odom_cam: Array
+    t_odom_cam: Array
+    path: Array
+
+    @staticmethod
+    def of(witnesses: Sequence[Witness]) -> _Evidence:
+        anchors = [w.anchor for w in witnesses]
+        return _Evidence(
+            np.array([a.T_map_cam.R for a in anchors]),
+            np.array([a.T_map_cam.t for a in anchors]),
+            np.array([a.cov_cam for a in anchors]),
+            np.array([w.T_odom_cam.R for w in witnesses]),
+            np.array([w.T_odom_cam.t for w in witnesses]),
+            np.array([w.path for w in witnesses]),
+        )
+
+
+def _chi2(S: Sim3, scale_sigma: float, e: _Evidence, config: Config) -> Array:
+    """Squared Mahalanobis length (N,) of the 6 residuals under S of each witness, as the newest sees it.
+
+    Infinite where the odometry between the two says too little to tell.
+    """
+    R_cam_map = np.swapaxes(e.R_map_cam, 1, 2)
+    off = S.apply(e.t_odom_cam) - e.t_map_cam
+    r = se3_log(R_cam_map @ S.R @ e.R_odom_cam, np.einsum("nij,nj->ni", R_cam_map, off))
     o = config.odometry
-    path = S.s * abs(w.path - origin.path)
-    apart = S.s * float(np.linalg.norm(w.T_odom_cam.t - origin.T_odom_cam.t))
+    path = S.s * np.abs(e.path - e.path[-1])
+    apart = S.s * np.linalg.norm(e.t_odom_cam - e.t_odom_cam[-1], axis=1)
     turn = o.rotation_floor_rad**2 + o.rotation_rad_per_sqrt_m**2 * path
     drift = (o.translation_ratio * path) ** 2 + o.translation_floor_m**2
     swing = apart**2 * (turn + scale_sigma**2 + o.scale_per_sqrt_m**2 * path / 3)
-    cov = w.anchor.cov_cam + origin.anchor.cov_cam
-    cov = cov + np.diag(np.r_[np.full(3, turn), np.full(3, drift + swing)])
-    return float(r @ np.linalg.solve(cov, r))
+    noise = np.repeat(np.stack([turn, drift + swing], axis=1), 3, axis=1)
+    cov = e.cov + e.cov[-1] + noise[:, :, None] * np.eye(6)
+    chi2 = np.einsum("ni,ni->n", r, np.linalg.solve(cov, r[..., None])[..., 0])
+    distance = np.linalg.norm(e.t_map_cam - e.t_map_cam[-1], axis=1)
+    vague = np.sqrt(drift + swing) > np.maximum(VAGUE_M, VAGUE_RATIO * distance)
+    return np.asarray(np.where(vague, np.inf, chi2))
 
 
 def _fit(S: Sim3, witnesses: Sequence[Witness], metric: bool) -> Sim3:

@@ -28,7 +28,7 @@ def edge_between(i: Keyframe, j: Keyframe, scale: float, config: Odometry) -> Re
     variance = np.r_[np.full(3, rotation), np.full(3, translation), walk**2 * max(metres, 1e-4)]
     if i.cov_cam is not None and j.cov_cam is not None:
         Ad = T_i_j.inverse().as_sim3().adjoint()[:6, :6]
-        variance[:6] = np.maximum(variance[:6], np.diag(j.cov_cam - Ad @ i.cov_cam @ Ad.T))
+        variance[:6] = np.fmax(variance[:6], np.diag(j.cov_cam - Ad @ i.cov_cam @ Ad.T))  # NaN is unknown
     return RelativePose(i.id, j.id, T_i_j, np.sqrt(variance))
 
 

@@ -17,7 +17,7 @@ from xalign_ros.core.lie import Array, hat
 from xalign_ros.core.transforms import SE3
 
 MAX_RAY_RAD = np.deg2rad(80.0)  # of a virtual pinhole
-CLEAR_MAJORITY = 0.8  # of the matches
+CLEAR_MAJORITY = 0.9  # of the matches, and twice the inliers that an anchor needs
 SWEEPS = 6  # at most, of each: Cauchy weights over all matches, then the inliers alone
 CAUCHY = 2.0  # standard deviations
 CONVERGED = 0.01  # length of a step in standard deviations of the pose
@@ -52,7 +52,7 @@ def estimate_pose(m: Points2D3D, camera: Camera, seed: int, config: Pnp, start: 
     if len(m.uv) < config.min_inliers:
         return "too_few_matches"
     near = refine_pose(start, m, camera, config) if start is not None else None
-    if isinstance(near, Pose) and near.inlier.mean() > CLEAR_MAJORITY:
+    if isinstance(near, Pose) and near.inlier.mean() > CLEAR_MAJORITY and near.inlier.sum() >= 2 * config.min_inliers:
         return near
     rays, valid = camera.unproject(m.uv)
     usable = np.flatnonzero(valid & (rays[:, 2] > np.cos(MAX_RAY_RAD)))

@@ -55,19 +55,27 @@ class Window:
         """Add an anchor to the keyframe `back` places behind the newest."""
         self._pending.push_back(anchor_factor(anchor, self._key - back, self._newest.s, self._huber))
 
-    def solve(self, extra_updates: int = SETTLE_UPDATES) -> Solution:
-        """Update with all that was added; the covariance is the newest keyframe's."""
+    def solve(self, extra_updates: int = SETTLE_UPDATES) -> Solution | None:
+        """Update with all that was added; the covariance is the newest keyframe's.
+
+        None where the numbers do not allow it (an odometry that leaps by thousands of kilometres); the window is spent then.
+        """
         stamps = {key: float(key) for key in self._values.keys()}  # noqa: SIM118 - gtsam.Values is no mapping
-        self._smoother.update(self._pending, self._values, stamps)
-        for _ in range(extra_updates):
-            self._smoother.update()
+        try:
+            self._smoother.update(self._pending, self._values, stamps)
+            for _ in range(extra_updates):
+                self._smoother.update()
+            estimate = self._smoother.calculateEstimate()
+            cov = self._smoother.marginalCovariance(self._key)
+            keys = sorted(estimate.keys())
+            poses = tuple(from_gtsam(estimate.atSimilarity3(k)) for k in keys)
+        except (RuntimeError, ValueError):  # an indeterminate system; a scale that is none
+            return None
+        if not (np.isfinite(cov).all() and np.isfinite(poses[-1].t).all()):
+            return None
         self._pending.resize(0)
         self._values.clear()
-        estimate = self._smoother.calculateEstimate()
-        keys = sorted(estimate.keys())
-        poses = tuple(from_gtsam(estimate.atSimilarity3(k)) for k in keys)
         self._newest = poses[-1]
-        cov = self._smoother.marginalCovariance(self._key)
         return Solution(tuple(self._ids[-len(keys) :]), poses, self._ids[-1], (cov + cov.T) / 2)
 
 
