@@ -18,12 +18,12 @@ def colmap(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with model/, database.db, and metric.tum of the images, which are named by their stamps in seconds."""
     work = tmp_path_factory.mktemp("colmap")
     world = room()
-    names = {name: f"{int(Path(name).stem)}.5.jpg" for name in world.truth}
+    names = {name: f"{int(Path(name).stem)}.5.jpg" for name in world.T_map_cam}
     images = {i: replace(image, name=names[image.name]) for i, image in world.model.images.items()}
     model = replace(world.model, images=images)
     write_model(model, work / "model", binary=False)
     write_database(work / "database.db", model, {names[n]: d for n, d in world.descriptors.items()})
-    rows = sorted((int(float(Path(names[n]).stem) * 1e9), T) for n, T in world.truth.items())
+    rows = sorted((int(float(Path(names[n]).stem) * 1e9), T) for n, T in world.T_map_cam.items())
     poses = [T for _, T in rows]
     stamps = np.array([stamp for stamp, _ in rows])
     write_tum(work / "metric.tum", Trajectory(stamps, np.array([T.R for T in poses]), np.array([T.t for T in poses])))
