@@ -1,6 +1,7 @@
 """The fixed-lag window against a batch solve of the whole problem; edges, predictions and what leaves the window."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -8,9 +9,10 @@ import pytest
 import worlds
 
 from xalign_ros.core.config import Config, Odometry, with_options
+from xalign_ros.core.graph import solve
 from xalign_ros.core.gtsam_bridge import anchor_factor, edge_factor, from_gtsam, prior_factor, to_gtsam
 from xalign_ros.core.odometry import METRIC_WALK, edge_between, odom_in_map, pose_covariance, predict
-from xalign_ros.core.records import Anchor, Features, Keyframe, Solution
+from xalign_ros.core.records import Anchor, Features, Keyframe, PoseGraph, Solution
 from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.core.window import WEAK_LOG_SCALE, WEAK_ROTATION_RAD, WEAK_TRANSLATION, Window
 
@@ -208,6 +210,20 @@ def test_far_behind_the_last_anchor_the_window_still_stands():
         sigmas.append(np.sqrt(np.trace(pose_covariance(solution.S_map_i[-1], solution.cov)[3:, 3:])))
     np.testing.assert_allclose(solution.S_map_i[-1].t, [0, 0, 1500], atol=1e-3)
     assert (np.diff(sigmas[10:]) > 0).all() and sigmas[-1] > 200
+
+
+def test_the_batch_stands_as_far_behind_the_last_anchor():
+    """300 edges of 5 m: the same sigma as the prediction's sums, and no exception."""
+    keyframes = keyframes_of([SE3(np.eye(3), [0, 0, 5.0 * n]) for n in range(301)])
+    edges = tuple(edge_between(i, j, 1.0, CONFIG.odometry) for i, j in pairwise(keyframes))
+    anchors = tuple((k.id, Anchor(k.id, 1, n, k.T_odom_cam, COV, 50, 50, 1.0)) for n, k in enumerate(keyframes[:5]))
+    start = tuple(k.T_odom_cam.as_sim3() for k in keyframes)
+    solution = solve(PoseGraph(tuple(k.id for k in keyframes), start, edges, anchors), CONFIG)
+    np.testing.assert_allclose(solution.S_map_i[-1].t, [0, 0, 1500], atol=1e-3)
+    S, cov = solution.S_map_i[0], solve(PoseGraph((10,), start[:1], (), anchors[:1]), CONFIG).cov
+    for edge in edges:
+        S, cov = predict(Solution((edge.i,), (S,), edge.i, cov), edge)
+    assert np.sqrt(solution.cov[3, 3]) == pytest.approx(np.sqrt(cov[3, 3]), rel=0.05) and cov[3, 3] > 100**2
 
 
 def test_numbers_that_allow_no_solution_are_no_exception():

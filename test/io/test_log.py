@@ -290,3 +290,21 @@ def test_two_publishers_of_one_topic_are_one_topic(tmp_path):
     with Log(tmp_path / "run.bag") as log:
         assert log.topics() == [Topic("/keyframes", m.KEYFRAME, 4)]
         assert [keyframe.id for _, keyframe, _ in log.keyframes()] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("tail", "read"), [(b"\xde\xad\xbe\xef", True), (bytes(40), False)])
+def test_what_rclpy_leaves_behind_a_message_is_no_damage(tmp_path, tail, read):
+    """serialize_message may end on a multiple of the last field's alignment, with bytes of no meaning."""
+    keyframes = some_keyframes(3)
+    with Rosbag2Writer(tmp_path / "log", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/keyframes", m.KEYFRAME, typestore=typestore())
+        for k in keyframes:
+            writer.write(connection, k.stamp_ns, cdr(k) + tail)
+    with Log(tmp_path / "log") as log:
+        if not read:
+            with pytest.raises(LogError, match="do not hold one"):
+                list(log.keyframes())
+            return
+        for (_, got, fault), k in zip(log.keyframes(), keyframes, strict=True):
+            assert fault is None
+            assert_same_keyframe(got, k)

@@ -56,7 +56,7 @@ def _build(args: argparse.Namespace) -> None:
     except ValueError as e:
         raise MapError(f"no map can be made from {source}: {e}") from None
     version = write_map(map_, args.output, force=args.force)
-    print(f"{args.output}: {len(map_.points)} points, {len(map_.keyframe_t)} keyframes, version {version}")
+    print(f"{args.output.name}: {len(map_.points)} points, {len(map_.keyframe_t)} keyframes, version {version}")
 
 
 def _from_log(args: argparse.Namespace) -> ReferenceMap:

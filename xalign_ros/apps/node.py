@@ -187,27 +187,27 @@ class XalignNode(Node):
         except Exception as error:  # of foreign bytes; what they make a deserializer raise has no list
             self._refuse("unreadable", f"a message of {len(data)} bytes: {error}")
             return
+        odom_frame = self._odom_frame if keyframe is None else keyframe.odom_frame
+        frames = {"odom_frame": odom_frame, "map_frame": self._map_frame}
         try:
             step = self._aligner.step(keyframe, fault)
+            messages = step_messages(ros_types, step, self._map, T_base_cam=self._T_base_cam, **frames)
         except Exception:
             self.get_logger().error(f"a step failed, the alignment begins anew\n{traceback.format_exc()}")
             self._begin("a step failed")
             self._beat()
             return
-        if keyframe is not None:
-            self._odom_frame = keyframe.odom_frame
         if step.correction is not None and keyframe is not None:
             self._answer = keyframe, step.correction.S_map_odom, newest(keyframe, step.correction)
         elif not step.state.localized:
             self._answer = None
-        frames = {"map_frame": self._map_frame, "odom_frame": self._odom_frame}
-        for topic, message in step_messages(ros_types, step, self._map, T_base_cam=self._T_base_cam, **frames).items():
+        for topic, message in messages.items():
             self._outputs[topic].publish(message)
         if step.rejection is not None and step.rejection.reason in INPUT_REASONS:
             self._refuse(step.rejection.reason, f"keyframe {step.keyframe_id}: {step.rejection.detail}")
         if step.state.state != self._state.state:
             self.get_logger().info(f"{step.state.state.name}: {step.state.reason}")
-        self._state = step.state
+        self._state, self._odom_frame = step.state, odom_frame
 
     def _beat(self) -> None:
         m = self._map

@@ -15,12 +15,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.signals import SignalHandlerOptions
-
 from xalign_ros.core.errors import ConfigError, XalignError
 from xalign_ros.core.intake import carries_pose
 from xalign_ros.core.records import Anchor, Correction, Step
@@ -40,6 +34,15 @@ from xalign_ros.io.ros_fields import ros_types, stamp_of
 from xalign_ros.io.run_output import OutputLog, Run, check_report, in_words, read_truth, remark, write_results
 from xalign_ros.io.step_messages import KEYFRAME_QUEUE, TOPICS
 from xalign_ros.io.xmap import read_map
+
+try:
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.node import Node
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from rclpy.signals import SignalHandlerOptions
+except ImportError as error:  # all else runs without ROS
+    raise XalignError(f"--live needs ROS 2 and the compiled xalign_msgs: {error}") from error
 
 AHEAD = KEYFRAME_QUEUE // 4  # keyframes under way at most
 KEPT = 1000  # messages that may wait for the player; far more than AHEAD keyframes bring

@@ -87,7 +87,7 @@ def _inliers(pose: Pose | str) -> int:
 
 
 def _elsewhere(a: Pose, b: Pose) -> bool:
-    """Two poses that differ by more than both covariances and a metre's tenth are two hypotheses."""
+    """Two poses that differ by more than five sigma of both are two hypotheses."""
     d = a.T_map_cam.t - b.T_map_cam.t
     sigma = np.sqrt(np.trace(a.cov_cam[3:, 3:]) + np.trace(b.cov_cam[3:, 3:]))
     return bool(np.linalg.norm(d) > 5 * sigma)

@@ -37,6 +37,11 @@ def solve(graph: PoseGraph, config: Config, *, metric: bool = False) -> Solution
     params.setRelativeErrorTol(1e-10)
     result = gtsam.LevenbergMarquardtOptimizer(factors, values, params).optimize()
     last = len(graph.keys) - 1
-    cov = gtsam.Marginals(factors, result).marginalCovariance(last)
+    # gtsam.Marginals knows Cholesky alone, which throws for a keyframe some 500 m behind the last anchor.
+    qr = gtsam.ISAM2Params()
+    qr.setFactorization("QR")
+    smoother = gtsam.ISAM2(qr)
+    smoother.update(factors, result)
+    cov = smoother.marginalCovariance(last)
     poses = tuple(from_gtsam(result.atSimilarity3(n)) for n in range(last + 1))
     return Solution(graph.keys, poses, graph.keys[-1], np.asarray((cov + cov.T) / 2))

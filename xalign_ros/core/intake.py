@@ -45,6 +45,8 @@ def _fault(k: Keyframe, earlier: Sequence[Keyframe], map_: ReferenceMap) -> tupl
     if not np.isfinite(f.uv).all() or not k.camera.inside(f.uv, BORDER_PX).all():
         worst = f.uv[~(np.isfinite(f.uv).all(axis=1) & k.camera.inside(f.uv, BORDER_PX))][0]
         return "bad_pixel", f"feature at {worst.tolist()} px is outside its {k.camera.width} x {k.camera.height} image"
+    if f.sigma_px is not None and not (np.isfinite(f.sigma_px).all() and (f.sigma_px > 0).all()):
+        return "bad_pixel", "a feature's sigma_px is not a positive number"
     width = map_.descriptors.shape[1]
     if (f.name, f.norm, f.descriptors.shape[1]) != (map_.descriptor_name, map_.norm, width):
         have = f"'{f.name}' {f.norm.name} of {f.descriptors.shape[1]}"

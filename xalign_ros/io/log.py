@@ -27,6 +27,7 @@ from xalign_ros.io.messages import KEYFRAME, keyframe_from_message
 from xalign_ros.io.msgdefs import message_definitions
 
 HEADER = "std_msgs/msg/Header"
+CDR_HEADER, CDR_TAIL = 4, 8  # bytes before a message, and fewer than these behind it
 LISTED = 12  # topics named in an error
 FOREVER = "sec: 9223372036\n    nsec: 854775807"
 # As the recorder writes it up to metadata version 8, the form which every later version reads too.
@@ -136,7 +137,7 @@ class Log:
         """
         for connection, time_ns, data in self._read({(self.keyframe_topic(topic), KEYFRAME)}):
             with self._named(connection, time_ns):
-                message = self._store(connection).deserialize_cdr(self._cdr(connection, data), KEYFRAME)
+                message = _deserialized(self._store(connection), self._cdr(connection, data), KEYFRAME)
             yield time_ns, *keyframe_from_message(message)
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
@@ -222,6 +223,16 @@ def _counts(connections: Iterable[Connection]) -> dict[tuple[str, str], int]:
     for c in connections:
         counts[c.topic, c.msgtype] += c.msgcount
     return dict(counts)
+
+
+def _deserialized(store: Typestore, data: bytes, kind: str) -> Any:
+    """The message; rclpy may leave a few undefined bytes behind it, which rosbags itself takes for damage."""
+    definition = store.get_msgdef(kind)
+    read = definition.deserialize_cdr_le if data[1] else definition.deserialize_cdr_be
+    message, end = read(memoryview(data)[CDR_HEADER:], 0, definition.cls, store)
+    if not 0 <= len(data) - CDR_HEADER - end < CDR_TAIL:
+        raise ValueError(f"{len(data)} bytes do not hold one {kind}")
+    return message
 
 
 class LogWriter:
