@@ -165,7 +165,7 @@ def test_malformed_messages_are_refused_and_the_run_goes_on(world, tmp_path):
                 send.publish(b"\x00\x01\x00\x00" + b"\xff" * 99)
                 send.publish(bytes(serialize_message(message))[:-100])
                 odometry.publish(ros_types(ODOMETRY)())
-            assert me.until(lambda: me.received["state"] and me.received["state"][-1].keyframes > n)  # noqa: B023
+            assert me.until(lambda n=n: me.received["state"] and me.received["state"][-1].keyframes > n)
         refused = {a.keyframe_id: a.reason for a in me.received["anchors"] if a.reason in FAULTS.values()}
         assert refused == {keyframes[n].id: reason for n, reason in FAULTS.items() if reason != "duplicate_id"}
         assert me.received["state"][-1].localized

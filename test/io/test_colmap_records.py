@@ -26,7 +26,7 @@ def test_records_are_read_only_and_own_their_arrays(tiny: ColmapModel) -> None:
         with pytest.raises(ValueError, match="read-only"):
             a[...] = 0
     with pytest.raises(AttributeError):
-        image.name = "b"  # type: ignore[misc]
+        image.name = "b"
 
 
 @pytest.mark.parametrize(
@@ -48,9 +48,9 @@ def test_records_are_read_only_and_own_their_arrays(tiny: ColmapModel) -> None:
 def test_image_refuses_what_cannot_be(change: dict[str, Any], words: str) -> None:
     good = dict(id=1, name="a", camera_id=1, R_cam_map=np.eye(3), t_cam_map=np.zeros(3), uv=np.zeros((1, 2)))
     good["point_ids"] = np.array([-1])
-    ColmapImage(**good)  # type: ignore[arg-type]
+    ColmapImage(**good)
     with pytest.raises(ValueError, match=words):
-        ColmapImage(**(good | change))  # type: ignore[arg-type]
+        ColmapImage(**(good | change))
 
 
 def test_model_refuses_tracks_that_do_not_fit(tiny: ColmapModel) -> None:

@@ -6,6 +6,7 @@ import hashlib
 
 import numpy as np
 
+from xalign_ros.core.camera import Camera
 from xalign_ros.core.config import Config
 from xalign_ros.core.lie import Array
 from xalign_ros.core.matching import NO_MATCHES, Matches, guided_matches, place_matches, places
@@ -56,7 +57,7 @@ def find_anywhere(keyframe: Keyframe, index: MapIndex, config: Config) -> Anchor
     return _result(keyframe, index, matches, best, max(others, default=0) / _inliers(best), config)
 
 
-def _camera(keyframe: Keyframe):  # type: ignore[no-untyped-def]
+def _camera(keyframe: Keyframe) -> Camera:
     assert keyframe.camera is not None
     return keyframe.camera
 

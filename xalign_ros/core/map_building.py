@@ -69,42 +69,11 @@ def build_map(
     obs = Observations(each, [f.uv for f in features], [f.descriptors for f in features], poses)
     track = _track_ids(keyframes, obs) if _have_tracks(keyframes) else matched_tracks(keyframes, poses)
     cameras, which = _distinct_cameras(each)
-    return assemble_map(
-        obs=obs,
-        track=track,
-        cameras=cameras,
-        keyframe_camera=which,
-        refine=True,
-        map_id=map_id,
-        source=source,
-        frame=frame,
-        metric=metric,
-        name=name,
-        norm=norm,
-    )
-
-
-def assemble_map(
-    *,
-    obs: Observations,
-    track: np.ndarray,
-    cameras: tuple[Camera, ...],
-    keyframe_camera: np.ndarray,
-    refine: bool,
-    map_id: str,
-    source: str,
-    frame: str,
-    metric: bool,
-    name: str,
-    norm: Norm,
-) -> ReferenceMap:
-    """Triangulate tracks (F,), -1 = none, and keep what is well determined."""
     used = np.flatnonzero((track >= 0) & obs.valid)
     track_index, compact = np.unique(track[used], return_inverse=True)
-    given = obs.poses
     points, sigma_px = _triangulate_twice(obs, used, compact, len(track_index))
     jitter_px = np.sqrt(max(sigma_px**2 - KEYPOINT_SIGMA_PX**2, 0.0))
-    if refine and points.kept.any() and jitter_px > 0:
+    if points.kept.any() and jitter_px > 0:
         bearings = _bearings(obs, used, compact, points, sigma_px)
         obs.move(refine_poses(obs.poses, points.xyz, bearings, jitter_px / float(np.median(obs.focal))))
         points, sigma_px = _triangulate_twice(obs, used, compact, len(track_index))
@@ -116,13 +85,13 @@ def assemble_map(
     feature_point[used] = np.where(points.inlier, new_index[compact], -1)
     return map_of_points(
         obs=obs,
-        given=given,
+        given=poses,
         points=points.xyz[points.kept],
         point_cov=points.cov[points.kept],
         feature_point=feature_point,
         sigma_px=sigma_px,
         cameras=cameras,
-        keyframe_camera=keyframe_camera,
+        keyframe_camera=which,
         map_id=map_id,
         source=source,
         frame=frame,

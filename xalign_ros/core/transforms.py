@@ -6,19 +6,19 @@ from dataclasses import dataclass
 from typing import overload
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from xalign_ros.core import lie
 from xalign_ros.core.lie import Array
 
 
-def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: object = np.float64) -> np.ndarray:
+def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: DTypeLike = np.float64) -> np.ndarray:
     """A read-only array of the asked shape (None = any length). Raises ValueError naming the field otherwise."""
-    a = np.array(value, dtype=dtype)  # type: ignore[call-overload]
+    a: np.ndarray = np.array(value, dtype=dtype)
     if a.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, a.shape, strict=True)):
         raise ValueError(f"{name} has shape {a.shape}, needed is {tuple('N' if n is None else n for n in shape)}")
     a.flags.writeable = False
-    return a  # type: ignore[no-any-return]
+    return a
 
 
 @dataclass(frozen=True, slots=True, eq=False)

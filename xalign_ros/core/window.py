@@ -60,7 +60,8 @@ class Window:
 
         None where the numbers do not allow it (an odometry that leaps by thousands of kilometres); the window is spent then.
         """
-        stamps = {key: float(key) for key in self._values.keys()}  # noqa: SIM118 - gtsam.Values is no mapping
+        keys = self._values.keys()  # gtsam.Values cannot be iterated itself
+        stamps = {key: float(key) for key in keys}
         try:
             self._smoother.update(self._pending, self._values, stamps)
             for _ in range(extra_updates):

@@ -232,7 +232,8 @@ def draw_all(run: Run) -> dict[str, tuple[str, bytes]]:
     pictures = {}
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(dict(item.split("=") for item in STYLE.split()))  # type: ignore[arg-type]
+        style: dict[Any, Any] = dict(item.split("=") for item in STYLE.split())
+        matplotlib.rcParams.update(style)
         for name, (draw, _) in PICTURES.items():
             if name != "error.png" or run.truth is not None:
                 figure, buffer = draw(run), BytesIO()
