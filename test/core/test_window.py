@@ -12,7 +12,7 @@ from xalign_ros.core.config import Config, Odometry, with_options
 from xalign_ros.core.graph import solve
 from xalign_ros.core.gtsam_bridge import anchor_factor, edge_factor, from_gtsam, prior_factor, to_gtsam
 from xalign_ros.core.odometry import METRIC_WALK, edge_between, odom_in_map, pose_covariance, predict
-from xalign_ros.core.records import Anchor, Features, Keyframe, PoseGraph, Solution
+from xalign_ros.core.records import Anchor, Estimate, Features, Keyframe, PoseGraph
 from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.core.window import WEAK_LOG_SCALE, WEAK_ROTATION_RAD, WEAK_TRANSLATION, Window
 
@@ -222,7 +222,7 @@ def test_the_batch_stands_as_far_behind_the_last_anchor():
     np.testing.assert_allclose(solution.S_map_i[-1].t, [0, 0, 1500], atol=1e-3)
     S, cov = solution.S_map_i[0], solve(PoseGraph((10,), start[:1], (), anchors[:1]), CONFIG).cov
     for edge in edges:
-        S, cov = predict(Solution((edge.i,), (S,), edge.i, cov), edge)
+        S, cov = predict(Estimate((edge.i,), (S,), edge.i, cov), edge)
     assert np.sqrt(solution.cov[3, 3]) == pytest.approx(np.sqrt(cov[3, 3]), rel=0.05) and cov[3, 3] > 100**2
 
 
@@ -344,7 +344,7 @@ def test_a_prediction_is_as_uncertain_as_it_errs():
     S = Sim3.exp([0.3, 0.2, 0.1, 1, 2, 3, -0.7])
     cov = np.diag([0.003] * 3 + [0.03] * 3 + [0.05]) ** 2
     edge = edge_between(*two_keyframes(2.0, S.s), S.s, Odometry())
-    mean, predicted = predict(Solution((1,), (S,), 1, cov), edge)
+    mean, predicted = predict(Estimate((1,), (S,), 1, cov), edge)
     np.testing.assert_allclose(mean.t, (S @ edge.T_i_j).t)
     draws = np.array(
         [

@@ -33,7 +33,7 @@ from xalign_ros.apps.node_parameters import declare_parameters, refuse_unknown, 
 from xalign_ros.core.aligner import Aligner
 from xalign_ros.core.errors import ConfigError, XalignError
 from xalign_ros.core.odometry import edge_between, pose_covariance, predict
-from xalign_ros.core.records import INPUT_REASONS, AlignmentState, Correction, Keyframe, Solution, State
+from xalign_ros.core.records import INPUT_REASONS, AlignmentState, Correction, Estimate, Keyframe, State
 from xalign_ros.core.transforms import Sim3
 from xalign_ros.io.messages import KEYFRAME, keyframe_from_message, state_message
 from xalign_ros.io.odometry_message import ODOMETRY, corrected_odometry, odometry_pose
@@ -176,7 +176,7 @@ class XalignNode(Node):
     def _begin(self, reason: str) -> None:
         """With nothing known but the map."""
         self._aligner = Aligner(self._map, self._config)
-        self._answer: tuple[Keyframe, Sim3, Solution] | None = None  # S_map_odom, and S_map_i to predict from
+        self._answer: tuple[Keyframe, Sim3, Estimate] | None = None  # S_map_odom, and S_map_i to predict from
         self._state = AlignmentState(
             State.UNINITIALIZED, reason, 0.0, 0, 0, None, UNKNOWN, False, UNKNOWN, UNKNOWN, 0, 0, 0, 0
         )
@@ -221,10 +221,10 @@ class XalignNode(Node):
         self.get_logger().warning(told, throttle_duration_sec=WARN_S)
 
 
-def newest(keyframe: Keyframe, c: Correction) -> Solution:
+def newest(keyframe: Keyframe, c: Correction) -> Estimate:
     """S_map_i of the correction's keyframe, to predict from."""
     Ad = keyframe.T_odom_cam.inverse().as_sim3().adjoint()
-    return Solution((keyframe.id,), (c.S_map_odom @ keyframe.T_odom_cam,), keyframe.id, Ad @ c.cov_odom @ Ad.T)
+    return Estimate((keyframe.id,), (c.S_map_odom @ keyframe.T_odom_cam,), keyframe.id, Ad @ c.cov_odom @ Ad.T)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -18,10 +18,10 @@ from xalign_ros.core.records import (
     AlignmentState,
     Anchor,
     Correction,
+    Estimate,
     Keyframe,
     Rejection,
     RelativePose,
-    Solution,
     State,
     Step,
 )
@@ -60,7 +60,7 @@ class Aligner:
         """Nothing that was learnt about the last session's frame holds for the next one's."""
         self._links: deque[_Link] = deque(maxlen=self.config.lock.memory)
         self._window: Window | None = None
-        self._solution: Solution | None = None
+        self._solution: Estimate | None = None
         self._anchored: _Link | None = None  # the last keyframe whose anchor was accepted
         self._unlocked = state, reason
 

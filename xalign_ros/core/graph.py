@@ -7,11 +7,11 @@ import numpy as np
 
 from xalign_ros.core.config import Config
 from xalign_ros.core.gtsam_bridge import anchor_factor, edge_factor, from_gtsam, prior_factor, to_gtsam
-from xalign_ros.core.records import PoseGraph, Solution
+from xalign_ros.core.records import Estimate, PoseGraph
 from xalign_ros.core.window import first_prior
 
 
-def solve(graph: PoseGraph, config: Config, *, metric: bool = False) -> Solution:
+def solve(graph: PoseGraph, config: Config, *, metric: bool = False) -> Estimate:
     """Levenberg-Marquardt over all keyframes from the graph's start values; the covariance is the last keyframe's.
 
     The first keyframe has the weak prior of a window's start. Raises ValueError on a graph without keyframes or with an
@@ -44,4 +44,4 @@ def solve(graph: PoseGraph, config: Config, *, metric: bool = False) -> Solution
     smoother.update(factors, result)
     cov = smoother.marginalCovariance(last)
     poses = tuple(from_gtsam(result.atSimilarity3(n)) for n in range(last + 1))
-    return Solution(graph.keys, poses, graph.keys[-1], np.asarray((cov + cov.T) / 2))
+    return Estimate(graph.keys, poses, graph.keys[-1], np.asarray((cov + cov.T) / 2))

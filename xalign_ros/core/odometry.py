@@ -6,7 +6,7 @@ import numpy as np
 
 from xalign_ros.core.config import Odometry
 from xalign_ros.core.lie import Array
-from xalign_ros.core.records import Keyframe, RelativePose, Solution
+from xalign_ros.core.records import Estimate, Keyframe, RelativePose
 from xalign_ros.core.transforms import SE3, Sim3
 
 METRIC_WALK = 0.1  # part of metric_scale_sigma that a metric odometry's scale may wander per sqrt(m)
@@ -32,7 +32,7 @@ def edge_between(i: Keyframe, j: Keyframe, scale: float, config: Odometry) -> Re
     return RelativePose(i.id, j.id, T_i_j, np.sqrt(variance))
 
 
-def predict(solution: Solution, edge: RelativePose) -> tuple[Sim3, Array]:
+def predict(solution: Estimate, edge: RelativePose) -> tuple[Sim3, Array]:
     """S_map_j and its covariance (7, 7) from the newest node of a solution and an edge: S_i Z, Ad(Z^-1) C Ad^T + Q."""
     S = solution.S_map_i[-1] @ edge.T_i_j
     Ad = edge.T_i_j.inverse().as_sim3().adjoint()

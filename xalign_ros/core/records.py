@@ -174,7 +174,7 @@ class PoseGraph:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution:
+class Estimate:
     """Estimates S_map_i of `keys`; cov (7, 7) is of `cov_key`, tangent rotation, translation (odometry units), log-scale."""
 
     keys: tuple[int, ...]
@@ -183,7 +183,7 @@ class Solution:
     cov: Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cov", frozen(self.cov, (7, 7), "Solution.cov"))
+        object.__setattr__(self, "cov", frozen(self.cov, (7, 7), "Estimate.cov"))
 
 
 class State(IntEnum):

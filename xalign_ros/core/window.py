@@ -8,7 +8,7 @@ import numpy as np
 from xalign_ros.core.config import Config
 from xalign_ros.core.gtsam_bridge import anchor_factor, edge_factor, from_gtsam, prior_factor, to_gtsam
 from xalign_ros.core.lie import Array
-from xalign_ros.core.records import Anchor, RelativePose, Solution
+from xalign_ros.core.records import Anchor, Estimate, RelativePose
 from xalign_ros.core.transforms import Sim3
 
 WEAK_ROTATION_RAD = 1.0
@@ -55,7 +55,7 @@ class Window:
         """Add an anchor to the keyframe `back` places behind the newest."""
         self._pending.push_back(anchor_factor(anchor, self._key - back, self._newest.s, self._huber))
 
-    def solve(self, extra_updates: int = SETTLE_UPDATES) -> Solution | None:
+    def solve(self, extra_updates: int = SETTLE_UPDATES) -> Estimate | None:
         """Update with all that was added; the covariance is the newest keyframe's.
 
         None where the numbers do not allow it (an odometry that leaps by thousands of kilometres); the window is spent then.
@@ -77,7 +77,7 @@ class Window:
         self._pending.resize(0)
         self._values.clear()
         self._newest = poses[-1]
-        return Solution(tuple(self._ids[-len(keys) :]), poses, self._ids[-1], (cov + cov.T) / 2)
+        return Estimate(tuple(self._ids[-len(keys) :]), poses, self._ids[-1], (cov + cov.T) / 2)
 
 
 def first_prior(S_map_first: Sim3, metric: bool, config: Config) -> tuple[Sim3, int, Array]:
