@@ -50,6 +50,7 @@ setup(
             "numpy>=2,<3",
             "scipy>=1.14,<2",
             "gtsam==4.3.0",
+            "qdldl==0.1.9.post1",
             "poselib==2.0.5",
             "opencv-python-headless==5.0.0.93",
             "mcap>=1.3,<2",

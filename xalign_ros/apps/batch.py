@@ -16,8 +16,10 @@ from xalign_ros.core.errors import MapError
 from xalign_ros.core.graph import solve
 from xalign_ros.core.intake import in_chain
 from xalign_ros.core.odometry import edge_between
-from xalign_ros.core.records import Keyframe, PoseGraph, Step
+from xalign_ros.core.pose_graph import PoseGraph
+from xalign_ros.core.records import Keyframe, Step
 from xalign_ros.core.reference_map import ReferenceMap
+from xalign_ros.core.run_graph import run_graph
 from xalign_ros.io.config_file import read_config
 from xalign_ros.io.log import Log
 from xalign_ros.io.tum import Trajectory, write_tum
@@ -75,8 +77,8 @@ def smooth(
         if any(step.correction for _, step in chain):
             graph = _graph(chain, config)
             stamps += [k.stamp_ns for k, _ in chain]
-            poses += [S.rigid_pose() for S in solve(graph, config, metric=chain[0][0].metric_scale).S_map_i]
-            anchors += len(graph.anchors)
+            poses += [S.rigid_pose() for S in solve(graph).S]
+            anchors += len(graph.anchors or ())
     rising, order = np.unique(np.array(stamps, np.int64), return_index=True)
     R, t = np.array([T.R for T in poses]).reshape(-1, 3, 3), np.array([T.t for T in poses]).reshape(-1, 3)
     result = {"keyframes": len(run_), "poses": len(poses), "sessions": len(sessions), "anchors": anchors}
@@ -93,5 +95,5 @@ def _graph(chain: list[tuple[Keyframe, Step]], config: Config) -> PoseGraph:
         if n:
             edges.append(edge_between(chain[n - 1][0], keyframe, known.s, config.odometry))
     believed = {a.keyframe_id: a for _, step in chain for a in (*step.believed, step.anchor) if a is not None}
-    anchors = tuple(sorted(believed.items()))
-    return PoseGraph(tuple(k.id for k, _ in chain), tuple(start), tuple(edges), anchors)
+    keys = [k.id for k, _ in chain]
+    return run_graph(keys, start, edges, sorted(believed.items()), config, metric=chain[0][0].metric_scale)

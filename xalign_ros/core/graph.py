@@ -1,47 +1,174 @@
-"""Batch: a whole Sim(3) pose graph at once, with the residuals of the sliding window."""
+"""Batch: a whole Sim(3) pose graph at once."""
 
 from __future__ import annotations
 
-import gtsam
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
-from xalign_ros.core.config import Config
-from xalign_ros.core.gtsam_bridge import anchor_factor, edge_factor, from_gtsam, prior_factor, to_gtsam
-from xalign_ros.core.records import Estimate, PoseGraph
-from xalign_ros.core.window import first_prior
+from xalign_ros.core.graph_chain import State
+from xalign_ros.core.graph_descent import STAGE_TOLERANCE, TOLERANCE, Descent, approach, descend, path_of
+from xalign_ros.core.graph_equations import Equations, Stages, nodes_at, residuals_at, state_of
+from xalign_ros.core.graph_system import Band, SingularError
+from xalign_ros.core.lie import Array
+from xalign_ros.core.pose_graph import Anchors, PoseGraph
+from xalign_ros.core.transforms import Sim3
 
 
-def solve(graph: PoseGraph, config: Config, *, metric: bool = False) -> Estimate:
-    """Levenberg-Marquardt over all keyframes from the graph's start values; the covariance is the last keyframe's.
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Estimates R (N, 3, 3), t (N, 3), s (N,) of the nodes `keys`, and how good they are.
 
-    The first keyframe has the weak prior of a window's start. Raises ValueError on a graph without keyframes or with an
-    edge or anchor at a keyframe that is not in it.
+    Costs are half chi-squares with the robust losses in them. `converged`: the last step, undamped, promised less than
+    a 1e-7th of the cost. `gradient_norm`: length of the cost's gradient to rotations (rad) and translations in the
+    common frame and log-scales. `gauge`: what had to be held for want of absolute evidence, "" if nothing. cov
+    (N, 7, 7), where asked for: marginals, right tangent (rotation, translation in units of the node, log-scale).
     """
-    if not graph.keys:
-        raise ValueError("a pose graph needs keyframes")
-    place = {key: n for n, key in enumerate(graph.keys)}
-    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for n, S in enumerate(graph.S_map_i):
-        values.insert(n, to_gtsam(S))
-    factors.push_back(prior_factor(*first_prior(graph.S_map_i[0], metric, config)))
+
+    keys: np.ndarray
+    R: Array
+    t: Array
+    s: Array
+    converged: bool
+    iterations: int
+    initial_cost: float
+    cost: float
+    costs: Mapping[str, float]
+    gradient_norm: float
+    gauge: str
+    cov: Array | None
+    _graph: PoseGraph = field(repr=False)
+    _stages: Stages = field(repr=False)
+
+    @property
+    def S(self) -> tuple[Sim3, ...]:
+        return tuple(Sim3(R, t, s) for R, t, s in zip(self.R, self.t, self.s, strict=True))
+
+    @property
+    def residuals(self) -> dict[str, Array]:
+        """Of each kind of factors (M, 7), whitened: their squared lengths are the chi-squares."""
+        return {kind: r for kind, (r, _) in self._factors().items()}
+
+    @property
+    def weights(self) -> dict[str, Array]:
+        """Of each kind of factors (M,): 1 for one that is believed, towards 0 for one that its loss sets aside."""
+        return {kind: w for kind, (_, w) in self._factors().items()}
+
+    def _factors(self) -> dict[str, tuple[Array, Array]]:
+        return residuals_at(self._graph, state_of(self.R, self.t, self.s), self._stages)
+
+
+def solve(graph: PoseGraph, *, max_iterations: int = 100, marginals: bool = False) -> Solution:
+    """The nodes that fit all factors best: Levenberg-Marquardt on exact gradients, from the graph's start values.
+
+    Chains and whatever keeps near some order of the nodes are solved in time linear in the nodes, loops by a sparse
+    factor. Losses that push no outlier away are reached by way of ones that do. A connected part without anchor, prior
+    or fixed node keeps its first node, one whose anchors leave the scale open its first node's scale. Raises ValueError
+    for marginals of a graph that leaves some direction open, or too large to have them.
+    """
+    equations = Equations(graph)
+    state = state_of(graph.R, graph.t, graph.s)
+    held, gauge = _gauge(graph, equations.d)
+    losses = {kind: block.loss for kind, block in graph.blocks()}
+    final: Stages = {kind: (loss, np.inf) for kind, loss in losses.items()}
+    start = equations.at(state, final)
+    descent = Descent(state, start, dict(equations.costs), 0, False, 0.0)
+    descent = approach(equations, descent, losses, held, max_iterations)
+    path = path_of(graph, descent.state)
+    for n, step in enumerate(path):
+        if descent.iterations or len(path) > 1:
+            descent = replace(descent, cost=equations.at(descent.state, step))
+        last = n == len(path) - 1
+        left = max_iterations - descent.iterations
+        descent = descend(
+            equations, descent, step, held, TOLERANCE if last else STAGE_TOLERANCE, left if last else min(left, 2)
+        )
+    state = descent.state
+    cov = _marginals(graph, equations, state, final, held) if marginals else None
+    R, t, sigma = nodes_at(state, slice(None))
+    kept = held[:, 5]
+    return Solution(
+        keys=graph.keys,
+        R=np.where(kept[:, None, None], graph.R, R),
+        t=np.where(kept[:, None], graph.t, t),
+        s=np.where(held[:, 6], graph.s, np.exp(sigma)),
+        converged=descent.converged,
+        iterations=descent.iterations,
+        initial_cost=start,
+        cost=descent.cost,
+        costs=descent.costs,
+        gradient_norm=descent.gradient_norm,
+        gauge=gauge,
+        cov=cov,
+        _graph=graph,
+        _stages=final,
+    )
+
+
+def _gauge(graph: PoseGraph, d: int) -> tuple[np.ndarray, str]:
+    """Which numbers (N, 7) are held, and a sentence on those that nobody asked to hold."""
+    n = len(graph)
+    held = np.zeros((n, 7), bool)
+    held[:, d:] = True
+    fixed = np.asarray(graph.fixed)
+    held[fixed] = True
+    blocks = dict(graph.blocks())
+    pairs = [(b.i, b.j) for b in blocks.values() if not isinstance(b, Anchors)]
+    i, j = (np.concatenate([pair[k] for pair in pairs] or [np.zeros(0, np.int64)]) for k in (0, 1))
+    if len(i) >= n - 1 and (i[: n - 1] == np.arange(n - 1)).all() and (j[: n - 1] == i[: n - 1] + 1).all():
+        count, part = 1, np.zeros(n, np.int64)  # a whole chain
+    else:
+        count, part = connected_components(sparse.csr_matrix((np.ones(len(i)), (i, j)), (n, n)), directed=False)
+    first = np.full(count, n)
+    first[part[::-1]] = np.arange(n)[::-1]
+    absolute = [b for b in blocks.values() if isinstance(b, Anchors)]
+    anchored = np.zeros(n, bool)
+    scaled = fixed.copy()
+    for block in absolute:
+        anchored[block.i] = True
+        scaled[block.i[block.information[:, 6, 6] > 0]] = True
+    loose = first[np.bincount(part[anchored | fixed], minlength=count) == 0]
+    lone = (np.bincount(part[anchored], minlength=count) == 1) & (np.bincount(part[scaled], minlength=count) == 0)
+    held[loose] = True
+    held[first[lone], 6] = True
+    words = []
+    if loose.size:
+        words.append(f"no anchor, prior or fixed node: held node {_named(graph, loose)}")
+    if lone.any() and graph.free_scale:
+        words.append(f"a single anchor leaves the scale open: held that of node {_named(graph, first[lone])}")
+    return held, "; ".join(words)
+
+
+def _named(graph: PoseGraph, rows: np.ndarray) -> str:
+    more = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
+    return ", ".join(str(graph.keys[row]) for row in rows[:3]) + more
+
+
+def _marginals(graph: PoseGraph, equations: Equations, state: State, stages: Stages, held: np.ndarray) -> Array:
+    """Diagonal blocks of the inverse normal equations, weights of the losses as they are at the solution."""
+    if not isinstance(equations.system, Band):
+        equations = Equations(graph, band_only=True)
+    band = equations.system
+    assert isinstance(band, Band)
+    equations.at(state, stages)
+    rows, axes = np.nonzero(held[:, : equations.d])
+    band.hold(rows, axes)
     try:
-        for edge in graph.edges:
-            factors.push_back(edge_factor(edge, place[edge.i], place[edge.j]))
-        for key, anchor in graph.anchors:
-            n = place[key]
-            factors.push_back(anchor_factor(anchor, n, graph.S_map_i[n].s, config.window.huber))
-    except KeyError as e:
-        raise ValueError(f"keyframe {e} of an edge or anchor is not in the pose graph") from None
-    params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(100)
-    params.setRelativeErrorTol(1e-10)
-    result = gtsam.LevenbergMarquardtOptimizer(factors, values, params).optimize()
-    last = len(graph.keys) - 1
-    # gtsam.Marginals knows Cholesky alone, which throws for a keyframe some 500 m behind the last anchor.
-    qr = gtsam.ISAM2Params()
-    qr.setFactorization("QR")
-    smoother = gtsam.ISAM2(qr)
-    smoother.update(factors, result)
-    cov = smoother.marginalCovariance(last)
-    poses = tuple(from_gtsam(result.atSimilarity3(n)) for n in range(last + 1))
-    return Estimate(graph.keys, poses, graph.keys[-1], np.asarray((cov + cov.T) / 2))
+        band.factor()
+    except SingularError:
+        raise ValueError("the pose graph leaves some direction open, so there are no marginals") from None
+    cov = np.zeros((len(graph), 7, 7))
+    cov[:, : equations.d, : equations.d] = band.marginals()
+    if not equations.local:
+        R, _, sigma = nodes_at(state, slice(None))
+        B = np.zeros((len(graph), 7, 7))
+        B[:, :3, :3] = np.swapaxes(R, 1, 2)
+        B[:, 3:6, 3:6] = B[:, :3, :3] * np.exp(-sigma)[:, None, None]
+        B[:, 6, 6] = 1
+        cov = B @ cov @ np.swapaxes(B, 1, 2)
+    cov[held] = 0
+    np.swapaxes(cov, 1, 2)[held] = 0
+    return np.asarray((cov + np.swapaxes(cov, 1, 2)) / 2)

@@ -27,23 +27,26 @@ def quat_from_rotation(R: ArrayLike) -> Array:
     """Unit quaternions (..., 4) x y z w with w >= 0 of rotations (..., 3, 3); Shepperd's branch of largest pivot."""
     R = np.asarray(R, float)
     m = R.reshape(-1, 9)
-    trace = m[:, 0] + m[:, 4] + m[:, 8]
-    pivots = np.stack([m[:, 0], m[:, 4], m[:, 8], trace], axis=1)
-    branch = pivots.argmax(axis=1)
-    q = np.empty((len(m), 4))
-    M = m.reshape(-1, 3, 3)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        r = branch == i
-        q[r, i] = 1 + 2 * M[r, i, i] - trace[r]
-        q[r, j] = M[r, j, i] + M[r, i, j]
-        q[r, k] = M[r, k, i] + M[r, i, k]
-        q[r, 3] = M[r, k, j] - M[r, j, k]
-    r = branch == 3
-    q[r] = np.stack([M[r, 2, 1] - M[r, 1, 2], M[r, 0, 2] - M[r, 2, 0], M[r, 1, 0] - M[r, 0, 1], 1 + trace[r]], axis=1)
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = m.T
+    trace = xx + yy + zz
+    Q = np.empty((len(m), 4, 4))  # 4 q q^T; its row with the largest diagonal has no cancellation
+    Q[:, 0, 0], Q[:, 1, 1], Q[:, 2, 2], Q[:, 3, 3] = (
+        1 + 2 * xx - trace,
+        1 + 2 * yy - trace,
+        1 + 2 * zz - trace,
+        1 + trace,
+    )
+    Q[:, 0, 1] = Q[:, 1, 0] = xy + yx
+    Q[:, 0, 2] = Q[:, 2, 0] = xz + zx
+    Q[:, 1, 2] = Q[:, 2, 1] = yz + zy
+    Q[:, 0, 3] = Q[:, 3, 0] = zy - yz
+    Q[:, 1, 3] = Q[:, 3, 1] = xz - zx
+    Q[:, 2, 3] = Q[:, 3, 2] = yx - xy
+    diagonal = Q.reshape(-1, 16)[:, ::5]
+    q = Q[np.arange(len(m)), diagonal.argmax(axis=1)]
+    q /= np.sqrt((q * q).sum(axis=1, keepdims=True))
     q[q[:, 3] < 0] *= -1
-    return q.reshape(*R.shape[:-2], 4)
+    return np.asarray(q.reshape(*R.shape[:-2], 4))
 
 
 def rotation_from_quat(q_xyzw: ArrayLike) -> Array:
@@ -51,13 +54,12 @@ def rotation_from_quat(q_xyzw: ArrayLike) -> Array:
     q = np.asarray(q_xyzw, float)
     with np.errstate(invalid="ignore", divide="ignore"):
         q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    x, y, z, w = np.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    R = np.empty((*q.shape[:-1], 3, 3))
+    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    return R
 
 
 def so3_exp(w: ArrayLike) -> Array:

@@ -206,7 +206,7 @@ class PoseGraph:
         for kind, block in self.blocks():
             for end in ("i", "j"):
                 rows = getattr(block, end, None)
-                if rows is not None and len(rows) and not (0 <= rows.min() and rows.max() < n):
+                if rows is not None and len(rows) and not (rows.min() >= 0 and rows.max() < n):
                     bad = int(np.flatnonzero((rows < 0) | (rows >= n))[0])
                     raise ValueError(f"{kind} {bad} names node {rows[bad]}; the pose graph has nodes 0 to {n - 1}")
 

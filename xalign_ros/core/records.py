@@ -164,16 +164,6 @@ class RelativePose:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseGraph:
-    """Keyframes `keys` with their start values S_map_i, odometry edges, and anchors (key, Anchor)."""
-
-    keys: tuple[int, ...]
-    S_map_i: tuple[Sim3, ...]
-    edges: tuple[RelativePose, ...]
-    anchors: tuple[tuple[int, Anchor], ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """Estimates S_map_i of `keys`; cov (7, 7) is of `cov_key`, tangent rotation, translation (odometry units), log-scale."""
 
