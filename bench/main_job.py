@@ -6,7 +6,6 @@ hololens_orb, demo, step_time. Positions and angles are causal errors in the map
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -14,12 +13,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import real_data
+from case import Case, run
 from hall import synthetic_hall
 from real_data import Posed
 
@@ -34,23 +34,6 @@ from xalign_ros.io.messages import anchor_from_message, correction_from_message,
 from xalign_ros.io.xmap import read_map
 
 SEEDS = 10
-
-
-@dataclass
-class Case:
-    """Figures of one case, each with its target; a peer's figure has none."""
-
-    name: str
-    rows: list[tuple[str, float, str]] = field(default_factory=list)
-    missed: list[str] = field(default_factory=list)
-
-    def figure(self, label: str, value: float, low: float = -np.inf, high: float = np.inf) -> None:
-        target = (
-            "" if low == -np.inf and high == np.inf else f"{low:g} .. {high:g}" if low > -np.inf else f"<= {high:g}"
-        )
-        self.rows.append((label, float(value), target))
-        if not low <= value <= high:
-            self.missed.append(f"{self.name}: {label} is {value:.4g}, target {target}")
 
 
 @dataclass
@@ -274,33 +257,18 @@ def timed(map_: Path, keyframes: Sequence[Keyframe]) -> tuple[list[float], list[
     return warm, cold
 
 
+def in_folder(job: Callable[[Case, Path], None]) -> Callable[[Case], None]:
+    def with_folder(case: Case) -> None:
+        with tempfile.TemporaryDirectory() as work:
+            job(case, Path(work))
+
+    return with_folder
+
+
 CASES: dict[str, Callable[[Case, Path], None]] = {
     f.__name__: f for f in (tango, anymal, anymal_wander, anymal_halves, hololens_sift, hololens_orb, demo, step_time)
 }
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=CASES)
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
-    cases = []
-    for name in [args.only] if args.only else list(CASES):
-        case = Case(name)
-        with tempfile.TemporaryDirectory() as work:
-            CASES[name](case, Path(work))
-        cases.append(case)
-        if not args.json:
-            print(f"\n{name}")
-            for label, value, target in case.rows:
-                print(f"  {label:68s} {value:10.4g}   {target}")
-    missed = [m for case in cases for m in case.missed]
-    if args.json:
-        print(json.dumps({c.name: {label: value for label, value, _ in c.rows} for c in cases} | {"missed": missed}))
-    for m in missed:
-        print(f"MISSED {m}", file=sys.stderr)
-    return 1 if missed else 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(__doc__, {name: in_folder(f) for name, f in CASES.items()}))

@@ -74,12 +74,14 @@ def solve(graph: PoseGraph, *, max_iterations: int = 100, marginals: bool = Fals
     held, gauge = _gauge(graph, equations.d)
     losses = {kind: block.loss for kind, block in graph.blocks()}
     final: Stages = {kind: (loss, np.inf) for kind, loss in losses.items()}
-    start = equations.at(state, final)
+    robust = any(loss.name != "none" for loss in losses.values())
+    start = equations.at(state, final, only_gradient=robust)
     descent = Descent(state, start, dict(equations.costs), 0, False, 0.0)
-    descent = approach(equations, descent, losses, held, max_iterations)
+    if robust:
+        descent = approach(equations, descent, final, held, max_iterations)
     path = path_of(graph, descent.state)
     for n, step in enumerate(path):
-        if descent.iterations or len(path) > 1:
+        if len(path) > 1:
             descent = replace(descent, cost=equations.at(descent.state, step))
         last = n == len(path) - 1
         left = max_iterations - descent.iterations

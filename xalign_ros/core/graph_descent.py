@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,30 +35,28 @@ class Descent:
     gradient_norm: float
 
 
-def approach(
-    equations: Equations, start: Descent, losses: Mapping[str, Loss], held: np.ndarray, budget: int
-) -> Descent:
-    """Newton steps with losses as wide as the residuals still are, while these shrink by them."""
-    wide = {kind: (loss, AS_WIDE_AS_NEEDED) for kind, loss in losses.items()}
-    descent, excess = start, _excess(equations, losses)
+def approach(equations: Equations, start: Descent, final: Stages, held: np.ndarray, budget: int) -> Descent:
+    """Newton steps with losses as wide as the residuals still are, while these shrink by them; then back to `final`."""
+    wide = {kind: (loss, AS_WIDE_AS_NEEDED) for kind, (loss, _) in final.items()}
+    descent, excess = start, _excess(equations, final)
+    equations.at(start.state, wide)
     while excess > 1 and descent.iterations < min(budget, MOST_APPROACHES):
-        if descent is start:
-            equations.at(start.state, wide)
         step = _step(equations, descent.state, held, 0.0)
         if step is None:
             break
-        state = step[0]
-        equations.at(state, wide)
-        before, excess = excess, _excess(equations, losses)
-        if not excess <= APPROACHES * before:
+        equations.at(step[0], wide)
+        before, excess = excess, _excess(equations, final)
+        if not excess <= max(1.0, APPROACHES * before):
             break
-        descent = replace(descent, state=state, iterations=descent.iterations + 1)
-    return descent
+        descent = replace(descent, state=step[0], iterations=descent.iterations + 1)
+    # A loss that is wide enough already was not widened.
+    cost = equations.at(descent.state, final) if excess > 1 else sum(equations.costs.values())
+    return replace(descent, cost=cost)
 
 
-def _excess(equations: Equations, losses: Mapping[str, Loss]) -> float:
+def _excess(equations: Equations, final: Stages) -> float:
     """How much wider than its loss the typical residual of a kind is, the worst of all kinds."""
-    return max((typical / losses[kind].width for kind, typical in equations.typical.items()), default=0.0)
+    return max((typical / final[kind][0].width for kind, typical in equations.typical.items()), default=0.0)
 
 
 def path_of(graph: PoseGraph, state: State) -> list[Stages]:
@@ -81,31 +78,28 @@ def descend(
 
     Near the end the factored matrix is used on, as long as the gradient shrinks by it (chord steps).
     """
-    state, cost, damping, iterations, left = start.state, start.cost, 0.0, 0, np.inf
+    state, cost, damping, iterations, last = start.state, start.cost, 0.0, 0, np.inf
     curved = factored = converged = False
     while iterations < budget and not converged and damping < MOST_DAMPING:
         iterations += 1
-        again = factored
         step = _step(equations, state, held, damping, factored)
-        enough = 2 * tolerance * cost + NOTHING
-        new = near = np.inf
+        again, new, near, chord = factored, np.inf, False, False
         if step is not None:
             near = step[1] <= NEAR * cost
-            new = equations.at(step[0], stages, only_gradient=bool(near))
+            chord = factored or (near and not damping and step[1] <= CHORD**2 * last)
+            new = equations.at(step[0], stages, newton=near, only_gradient=chord)
+            converged = damping <= TRUSTED_DAMPING and step[1] <= 2 * tolerance * cost + NOTHING
         if step is not None and new <= cost:
-            before = step[1] if not again else left
-            state, cost = step[0], new
-            left = _promise(equations, state, held) if near and not damping else np.inf
-            converged = damping <= TRUSTED_DAMPING and min(step[1], left) <= enough
-            factored = bool(near) and not damping and left <= CHORD * before
+            state, cost, last, curved = step[0], new, step[1], near
             damping = damping / 10 if damping > LEAST_DAMPING else 0.0
-            if near and not (converged or factored):
-                equations.at(state, stages, newton=True)
-                curved = True
+            if chord and not converged:
+                left = _promise(equations, state, held)
+                converged, factored = left <= 2 * tolerance * cost + NOTHING, left <= CHORD * last
+                if not (converged or factored):
+                    equations.at(state, stages, newton=True)
         else:
-            converged = step is not None and damping <= TRUSTED_DAMPING and step[1] <= enough
             damping = damping if curved or again else max(10 * damping, FIRST_DAMPING)
-            curved = factored = False
+            last, curved, factored = np.inf, False, False
             equations.at(state, stages)
     norm = float(np.linalg.norm(_projected(equations.gradient, state, held)))
     return Descent(state, cost, dict(equations.costs), start.iterations + iterations, converged, norm)

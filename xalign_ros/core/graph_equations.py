@@ -36,12 +36,15 @@ class _Kind:
         i, j = block.i, getattr(block, "j", None)
         ends = i if j is None else np.concatenate([i, j])
         diagonal, gradient = Scatter.to(ends, into.diagonal), Scatter.to(ends, lambda n: n)
+        d = into.d
+        omega = information(block)
+        omega = np.ascontiguousarray(omega[:, :d] if omega.ndim == 2 else omega[:, :d, :d])
         if j is None:
-            return _Kind(name, block, information(block), i, None, np.zeros(0, bool), diagonal, None, gradient)
+            return _Kind(name, block, omega, i, None, np.zeros(0, bool), diagonal, None, gradient)
         swapped = into.swapped(i, j)
         keys = np.where(swapped, j, i) * nodes + np.where(swapped, i, j)
         lower = Scatter.to(keys, into.lower)
-        return _Kind(name, block, information(block), i, j, swapped, diagonal, lower, gradient)
+        return _Kind(name, block, omega, i, j, swapped, diagonal, lower, gradient)
 
 
 class Equations:
@@ -97,8 +100,8 @@ class Equations:
     def _add(self, kind: _Kind, state: State, stage: Stage, newton: bool, only_gradient: bool) -> float:
         d, i = self.d, nodes_at(state, kind.i)
         j = None if kind.j is None else nodes_at(state, kind.j)
-        r, J_i, J_j = linearize(kind.block, i, j)
-        omega = kind.information
+        r, J_i, J_j = linearize(kind.block, i, j, d)
+        r, omega = r[:, :d], kind.information
         flat = omega.ndim == 2
         pull = omega * r if flat else (omega @ r[..., None])[..., 0]
         chi2 = np.einsum("mi,mi->m", r, pull)
@@ -132,7 +135,7 @@ class Equations:
     def _turned(self, J: Array, nodes: Nodes) -> Array:
         """Jacobians (M, 7, 7) to right perturbations, as (M, 7, d) to those that the equations are in."""
         if self.local:
-            return J[:, :, : self.d]
+            return J[:, : self.d, : self.d]
         Rt = np.swapaxes(nodes[0], 1, 2)
         out = J.copy()
         out[:, :, :3] = J[:, :, :3] @ Rt

@@ -21,10 +21,13 @@ SERIES_RADIUS = 5.0  # of Bernoulli's series, which reaches to 2 pi
 _BERNOULLI = bernoulli(120)
 
 
-def linearize(block: Factors, i: Nodes, j: Nodes | None) -> Linear:
-    """Unweighted residuals and Jacobians at the nodes of both ends (j is None for anchors and priors)."""
+def linearize(block: Factors, i: Nodes, j: Nodes | None, d: int = 7) -> Linear:
+    """Unweighted residuals and Jacobians at the nodes of both ends (j is None for anchors and priors).
+
+    With d = 6 every scale is 1 and only the first six rows and columns are asked for.
+    """
     if isinstance(block, Anchors):
-        return *_charted(_between((block.R, block.t, np.log(block.s)), i), block.chart), None
+        return *_charted(_between((block.R, block.t, np.log(block.s)), i), block.chart, d), None
     assert j is not None
     if isinstance(block, OdometryEdges):
         return _odometry(block, _between(i, j))
@@ -32,8 +35,8 @@ def linearize(block: Factors, i: Nodes, j: Nodes | None) -> Linear:
         return _scale_free(block, _between(i, j), i[2])
     if isinstance(block, SimilarityEdges):
         P = _between(i, j)
-        r, J = _charted(_between((block.R, block.t, np.log(block.s)), P), block.chart)
-        return r, -J @ sim3_adjoint(*_inverse(P)), J
+        r, J = _charted(_between((block.R, block.t, np.log(block.s)), P), block.chart, d)
+        return r, -J @ sim3_adjoint(*_inverse(P))[:, : J.shape[1], : J.shape[1]], J
     r, J = np.zeros((len(block), 7)), np.zeros((len(block), 7, 7))
     r[:, 6], J[:, 6, 6] = j[2] - i[2], 1
     return r, -J, J
@@ -120,11 +123,11 @@ def _scale_free(block: ScaleFreeEdges, P: Nodes, log_scale_i: Array) -> Linear:
     return r, Ji, Jj
 
 
-def _charted(E: Nodes, chart: Chart) -> tuple[Array, Array]:
+def _charted(E: Nodes, chart: Chart, d: int) -> tuple[Array, Array]:
     """chart(E) (M, 7), and the Jacobian (M, 7, 7) of chart(E Exp(d)) with respect to d."""
     if chart is Chart.LOG:
         x = sim3_log(E[0], E[1], np.exp(E[2]))
-        return x, sim3_right_jacobian_inverse(x)
+        return x, sim3_right_jacobian_inverse(x, d)
     J = np.zeros((len(E[1]), 7, 7))
     if chart is Chart.SPLIT:
         r = so3_log(E[0])
@@ -157,24 +160,24 @@ def so3_right_jacobian_inverse(w: Array) -> Array:
     return np.asarray(EYE3 + W / 2 + c[:, None, None] * (W @ W))
 
 
-def sim3_right_jacobian_inverse(x: Array) -> Array:
-    """J_r^-1 (M, 7, 7) with Log(Exp(x) Exp(d)) = x + J_r^-1 d + O(d^2): sum of B_n / n! ad(x)^n, B_1 = +1/2.
+def sim3_right_jacobian_inverse(x: Array, d: int = 7) -> Array:
+    """J_r^-1 (M, d, d) with Log(Exp(x) Exp(e)) = x + J_r^-1 e + O(e^2): sum of B_n / n! ad(x)^n, B_1 = +1/2.
 
     Bernoulli's series of A e^A / (e^A - 1) converges while the eigenvalues of ad(x), which are 0, log-scale and
-    log-scale +- i |w|, stay inside 2 pi; beyond, from the integral of Exp(-tau ad(x)) (Eade 2013).
+    log-scale +- i |w|, stay inside 2 pi; beyond, from the integral of Exp(-tau ad(x)) (Eade 2013). d = 6 is SE(3).
     """
-    A = np.zeros((len(x), 7, 7))
+    A = np.zeros((len(x), d, d))
     W = hat(x[:, :3])
     A[:, :3, :3] = A[:, 3:6, 3:6] = W
     A[:, 3:6, :3] = hat(x[:, 3:6])
-    A[:, 3:6, 3:6] += x[:, 6, None, None] * EYE3
-    A[:, 3:6, 6] = -x[:, 3:6]
+    if d == 7:
+        A[:, 3:6, 3:6] += x[:, 6, None, None] * EYE3
+        A[:, 3:6, 6] = -x[:, 3:6]
     radius = np.hypot(np.linalg.norm(x[:, :3], axis=1), x[:, 6])
     near = float(radius[radius < SERIES_RADIUS].max(initial=0.0))
-    reach = float(np.abs(A).max(initial=1.0))
-    J = np.eye(7) + A / 2
+    J = np.eye(d) + A / 2
     A2 = A @ A
-    power, factorial, size = A2, 2.0, reach * max(near, 1e-3)
+    power, factorial, size = A2, 2.0, float(np.abs(A).max(initial=1.0)) * max(near, 1e-3)
     for n in range(2, len(_BERNOULLI), 2):
         J += (_BERNOULLI[n] / factorial) * power
         size *= (near / (2 * np.pi)) ** 2
@@ -184,7 +187,7 @@ def sim3_right_jacobian_inverse(x: Array) -> Array:
         factorial *= (n + 1) * (n + 2)
     far = np.flatnonzero(radius >= SERIES_RADIUS)
     if far.size:
-        twice = np.zeros((far.size, 14, 14))
-        twice[:, :7, :7], twice[:, :7, 7:] = -A[far], np.eye(7)
-        J[far] = np.linalg.inv(expm(twice)[:, :7, 7:])
+        twice = np.zeros((far.size, 2 * d, 2 * d))
+        twice[:, :d, :d], twice[:, :d, d:] = -A[far], np.eye(d)
+        J[far] = np.linalg.inv(expm(twice)[:, :d, d:])
     return J

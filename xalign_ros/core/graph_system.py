@@ -59,17 +59,14 @@ class Band:
 
     def __init__(self, nodes: int, d: int, width: int, place: np.ndarray | None) -> None:
         self.place, self.d, self.w = place, d, d * (width + 1)
-        self.H = np.zeros((nodes, d, self.w))
-        self._fresh = True
+        self.H = np.empty((nodes, d, self.w))  # not zeros: those come in small pages, which cost as much as a factor
         u, v = np.tril_indices(d)
         self._diagonal = v * self.w + u - v
         u, v = np.divmod(np.arange(d * d), d)
         self._lower = v * self.w + u - v
 
     def clear(self) -> None:
-        if not self._fresh:
-            self.H[:] = 0
-        self._fresh = False
+        self.H[:] = 0
 
     @property
     def flat(self) -> Array:
