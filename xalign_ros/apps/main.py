@@ -15,6 +15,7 @@ COMMANDS = {
     "map": "build, inspect and check reference maps",
     "replay": "align a log to a map, without ROS or (--live) through the running node",
     "batch": "smooth whole logs: every keyframe's pose from all the evidence",
+    "solve": "solve a pose graph in a g2o file",
     "log": "what is in a log",
     "node": "the live ROS 2 node",
 }

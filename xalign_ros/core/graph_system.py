@@ -6,6 +6,7 @@ sparse LDL^T (QDLDL, Stellato et al. 2020; SuperLU where it is not installed).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -181,20 +182,30 @@ class Sparse:
 
     def factor(self) -> None:
         """Raises SingularError."""
-        U = self._upper
-        U.data[:] = self.flat[self._order]
+        self._upper.data[:] = self.flat[self._order]
         try:
-            if qdldl is None:
-                self._solver = splu((U + U.T - sparse.diags(U.diagonal())).tocsc(), permc_spec="MMD_AT_PLUS_A")
-            elif self._solver is None:
-                self._solver = qdldl.Solver(U, upper=True)
+            if qdldl is None or self._solver is None:
+                self._solver = _solver(self._upper)
             else:
-                self._solver.update(U, upper=True)
+                self._solver.update(self._upper, upper=True)
         except RuntimeError:  # of both: a pivot that is zero
             raise SingularError from None
 
     def solve(self, g: Array) -> Array:
         return np.asarray(self._solver.solve(g.reshape(-1))).reshape(g.shape)
+
+
+def _solver(upper: sparse.csc_matrix) -> Any:
+    """Of the symmetric matrix with this upper triangle."""
+    if qdldl is not None:
+        return qdldl.Solver(upper, upper=True)
+    return splu((upper + upper.T - sparse.diags(upper.diagonal())).tocsc(), permc_spec="MMD_AT_PLUS_A")
+
+
+def factored(H: sparse.csc_matrix) -> Callable[[Array], Array]:
+    """x -> H^-1 x of a symmetric positive definite matrix."""
+    solve: Callable[[Array], Array] = _solver(sparse.triu(H, format="csc")).solve
+    return solve
 
 
 def _damped(curvature: Array, damping: float) -> Array:

@@ -180,6 +180,7 @@ class PoseGraph:
     odometry: OdometryEdges | None = None
     scale_free: ScaleFreeEdges | None = None
     similarities: SimilarityEdges | None = None
+    loops: SimilarityEdges | None = None  # with a loss of their own
     anchors: Anchors | None = None
     priors: Anchors | None = None
     smoothness: ScaleSmoothness | None = None
@@ -215,7 +216,7 @@ class PoseGraph:
 
     def blocks(self) -> Iterator[tuple[str, Factors]]:
         """The kinds of factors that are there, by name, in one fixed order."""
-        for kind in ("odometry", "scale_free", "similarities", "anchors", "priors", "smoothness"):
+        for kind in ("odometry", "scale_free", "similarities", "loops", "anchors", "priors", "smoothness"):
             block = getattr(self, kind)
             if block is not None and len(block):
                 yield kind, block
