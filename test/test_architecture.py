@@ -91,12 +91,21 @@ def offenders(paths, of):
 
 
 def test_the_folders_are_those_of_the_design():
-    assert {p.parts[0] for p in FILES if len(p.parts) > 1} == {"core", "io", "apps"}
+    assert {p.parts[0] for p in FILES if len(p.parts) > 1} == {"core", "io", "apps", "compat"}
     assert {p.name for p in FILES if len(p.parts) == 1} <= {"__init__.py", "__main__.py"}
 
 
 def test_core_knows_neither_io_nor_apps():
     assert not offenders(CORE, lambda p: folder_imports(p, "io") | folder_imports(p, "apps"))
+
+
+def test_compat_knows_the_core_alone_and_nobody_knows_compat():
+    def wrong(path):
+        if path.parts[0] == "compat":
+            return folder_imports(path, "io") | folder_imports(path, "apps")
+        return folder_imports(path, "compat")
+
+    assert not offenders(FILES, wrong)
 
 
 def test_io_does_not_know_apps():

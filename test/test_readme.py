@@ -43,6 +43,14 @@ def test_commands_run_in_the_order_of_the_page(demo: Path) -> None:
         assert "Traceback" not in done.stderr and "Warning" not in done.stderr, f"{line}: {done.stderr}"
 
 
+def test_the_example_of_the_pose_graph_page_prints_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
+    code = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "graph.md").read_text(), re.M | re.S)
+    assert len(code) == 1
+    exec(code[0], {})
+    numbers = re.findall(r"-?\d+\.\d+(?:e-?\d+)?", capsys.readouterr().out)
+    assert [round(float(x), 6) for x in numbers] == [0, 1.5, 3, 1.5, 1.5, 1.5]
+
+
 def test_live_commands_give_the_hash_of_the_replay(demo: Path) -> None:
     pytest.importorskip("rclpy", reason="the live node needs rclpy")
     import json

@@ -1,0 +1,1 @@
+"""Other programs' names for what the core does."""

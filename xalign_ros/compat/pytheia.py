@@ -1,0 +1,17 @@
+"""`import xalign_ros.compat.pytheia as pt`: pyTheia's cross-reconstruction API as `pt.sfm`, over our engine.
+
+docs/pytheia.md has every name, its counterpart in the core, and where we do what the page means instead of what 1.2.1
+does.
+"""
+
+from types import SimpleNamespace
+
+from xalign_ros.compat import pytheia_pose_graph, pytheia_reconstruction, pytheia_structs
+
+sfm = SimpleNamespace(
+    **{
+        name: getattr(module, name)
+        for module in (pytheia_pose_graph, pytheia_reconstruction, pytheia_structs)
+        for name in module.__all__
+    }
+)

@@ -1,0 +1,234 @@
+"""pyTheia's reconstruction as far as a pose graph needs it: mutable, by id, world to camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from xalign_ros.core.lie import Array, sim3_exp, sim3_log, so3_exp, so3_log
+from xalign_ros.core.transforms import Sim3
+
+__all__ = [
+    "Camera",
+    "GetSim3LieFromView",
+    "Reconstruction",
+    "RelativeSim3BetweenViews",
+    "SetViewCameraFromSim3Lie",
+    "Sim3FromRotationTranslationScale",
+    "Sim3ToHomogeneousMatrix",
+    "Sim3ToRotationTranslationScale",
+    "Track",
+    "View",
+    "kInvalidTrackId",
+    "kInvalidViewId",
+]
+
+kInvalidViewId = kInvalidTrackId = 2**32 - 1  # pyTheia's names
+SOPHUS = [3, 4, 5, 0, 1, 2, 6]  # where our rotation, translation, log-scale stand in its tangent, and back
+
+
+class Camera:
+    """A camera's position (3,) in the world and its world-to-camera rotation (3, 3)."""
+
+    def __init__(self) -> None:
+        self._position, self._rotation = np.zeros(3), np.eye(3)
+
+    def GetPosition(self) -> Array:
+        return self._position.copy()
+
+    def SetPosition(self, position: ArrayLike) -> None:
+        self._position = _vector(position, 3, "a position")
+
+    def GetOrientationAsRotationMatrix(self) -> Array:
+        return self._rotation.copy()
+
+    def SetOrientationFromRotationMatrix(self, rotation: ArrayLike) -> None:
+        R = np.array(rotation, float)
+        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+            raise ValueError("an orientation must be a rotation matrix (3, 3)")
+        self._rotation = R
+
+    def GetOrientationAsAngleAxis(self) -> Array:
+        return so3_log(self._rotation)
+
+    def SetOrientationFromAngleAxis(self, angle_axis: ArrayLike) -> None:
+        self._rotation = so3_exp(_vector(angle_axis, 3, "an angle-axis"))
+
+
+class View:
+    def __init__(self, name: str, timestamp: float = 0.0) -> None:
+        self._name, self._timestamp, self._estimated, self._camera = name, timestamp, False, Camera()
+
+    def Name(self) -> str:
+        return self._name
+
+    def GetTimestamp(self) -> float:
+        return self._timestamp
+
+    def IsEstimated(self) -> bool:
+        return self._estimated
+
+    def SetIsEstimated(self, estimated: bool) -> None:
+        self._estimated = bool(estimated)
+
+    def Camera(self) -> Camera:
+        return self._camera
+
+    MutableCamera = Camera
+
+
+class Track:
+    def __init__(self) -> None:
+        self._point, self._estimated, self._views = np.array([0.0, 0, 0, 1]), False, set[int]()
+
+    def Point(self) -> Array:
+        """Homogeneous (4,)."""
+        return self._point.copy()
+
+    def SetPoint(self, point: ArrayLike) -> None:
+        self._point = _vector(point, 4, "a point (homogeneous)")
+
+    def IsEstimated(self) -> bool:
+        return self._estimated
+
+    def SetIsEstimated(self, estimated: bool) -> None:
+        self._estimated = bool(estimated)
+
+    def AddView(self, view_id: int) -> None:
+        self._views.add(int(view_id))
+
+    def NumViews(self) -> int:
+        return len(self._views)
+
+    def ViewIds(self) -> set[int]:
+        return set(self._views)
+
+
+class Reconstruction:
+    """Views and tracks by id. View(id), Track(id) of an unknown id are None; AddView of a known name or time fails."""
+
+    def __init__(self) -> None:
+        self._views: dict[int, View] = {}
+        self._tracks: dict[int, Track] = {}
+
+    def AddView(self, name: str, timestamp: float) -> int:
+        """The new view's id, or kInvalidViewId where the name or the timestamp is taken."""
+        if any(name == v.Name() or timestamp == v.GetTimestamp() for v in self._views.values()):
+            return kInvalidViewId
+        self._views[len(self._views)] = View(name, timestamp)
+        return len(self._views) - 1
+
+    def View(self, view_id: int) -> View | None:
+        return self._views.get(view_id)
+
+    MutableView = View
+
+    def ViewIds(self) -> list[int]:
+        return list(self._views)
+
+    def NumViews(self) -> int:
+        return len(self._views)
+
+    def ViewIdFromName(self, name: str) -> int:
+        return next((k for k, v in self._views.items() if v.Name() == name), kInvalidViewId)
+
+    def AddTrack(self) -> int:
+        self._tracks[len(self._tracks)] = Track()
+        return len(self._tracks) - 1
+
+    def AddObservation(self, view_id: int, track_id: int, feature: object = None) -> bool:
+        """False for an unknown view or track; the feature itself is not of a pose graph and is not kept."""
+        if view_id not in self._views or track_id not in self._tracks:
+            return False
+        self._tracks[track_id].AddView(view_id)
+        return True
+
+    def Track(self, track_id: int) -> Track | None:
+        return self._tracks.get(track_id)
+
+    MutableTrack = Track
+
+    def TrackIds(self) -> list[int]:
+        return list(self._tracks)
+
+    def NumTracks(self) -> int:
+        return len(self._tracks)
+
+
+def Sim3FromRotationTranslationScale(R: ArrayLike, t: ArrayLike, scale: float) -> Array:
+    """Sophus' tangent (7,): translation, rotation, log-scale."""
+    return Sim3(np.asarray(R, float), np.asarray(t, float), scale).log()[SOPHUS]
+
+
+def Sim3ToRotationTranslationScale(lie: ArrayLike) -> tuple[Array, Array, float]:
+    S = similarity(lie, "a Sim(3) tangent")
+    return S.R, S.t, S.s
+
+
+def Sim3ToHomogeneousMatrix(lie: ArrayLike) -> Array:
+    """[s R, t; 0, 1] (4, 4)."""
+    S = similarity(lie, "a Sim(3) tangent")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = S.s * S.R, S.t
+    return T
+
+
+def GetSim3LieFromView(view: View) -> Array:
+    """Log of world to camera, with scale 1, in Sophus' order. Raises ValueError where there is no view."""
+    return _of_view(view).log()[SOPHUS]
+
+
+def RelativeSim3BetweenViews(view_i: View, view_j: View) -> Array:
+    """Log(S_i^-1 S_j) of the two views' world-to-camera similarities, in Sophus' order."""
+    return (_of_view(view_i).inverse() @ _of_view(view_j)).log()[SOPHUS]
+
+
+def SetViewCameraFromSim3Lie(view: View, lie: ArrayLike) -> None:
+    """The view's camera at R, c = -R^T t of a world-to-camera similarity; the scale has no place in a camera."""
+    S = similarity(lie, "a Sim(3) tangent")
+    _of_view(view)
+    view.Camera().SetOrientationFromRotationMatrix(S.R)
+    view.Camera().SetPosition(-S.R.T @ S.t)
+
+
+def _of_view(view: View | None) -> Sim3:
+    if view is None:
+        raise ValueError("there is no such view in the reconstruction")
+    R = view.Camera().GetOrientationAsRotationMatrix()
+    return Sim3(R, -R @ view.Camera().GetPosition(), 1.0)
+
+
+def similarity(lie: ArrayLike, what: str) -> Sim3:
+    """Of Sophus' tangent (7,). Raises ValueError on other shapes and on numbers that are not finite."""
+    x = _vector(lie, 7, what)
+    R, t, s = sim3_exp(x[SOPHUS])
+    return Sim3(R, t, float(s))
+
+
+def tangents(R: Array, t: Array, s: Array) -> Array:
+    """(N, 7) in Sophus' order."""
+    return sim3_log(R, t, s)[:, SOPHUS]
+
+
+def views_of(reconstruction: Reconstruction, ids: list[int], role: str) -> Mapping[int, View]:
+    """The views by id. Raises ValueError on an id that is not there or is named twice."""
+    views: dict[int, View] = {}
+    for view_id in ids:
+        view = reconstruction.View(int(view_id))
+        if view is None:
+            raise ValueError(f"{role} view {view_id} is not in its reconstruction")
+        if int(view_id) in views:
+            raise ValueError(f"{role} view {view_id} is named twice")
+        views[int(view_id)] = view
+    return views
+
+
+def _vector(value: ArrayLike, size: int, what: str) -> Array:
+    x = np.array(value, float).reshape(-1) if np.size(value) == size else np.zeros(0)
+    if len(x) != size:
+        raise ValueError(f"{what} has {size} numbers, not {np.size(value)}")
+    if not np.isfinite(x).all():
+        raise ValueError(f"{what} has a number that is not finite")
+    return x

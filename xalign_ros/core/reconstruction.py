@@ -1,0 +1,103 @@
+"""The record of a reconstruction: views, cameras, priors, tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from xalign_ros.core.camera import Camera
+from xalign_ros.core.lie import Array
+from xalign_ros.core.transforms import frozen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosePriors:
+    """What is known beforehand of T_world_cam of some views (rows, K): R (K, 3, 3), t (K, 3).
+
+    R_information (K, 3, 3) is of the right tangent (rad), t_information (K, 3, 3) in world axes; zero says nothing.
+    Raises ValueError on shapes and numbers that are not finite.
+    """
+
+    views: np.ndarray
+    R: Array
+    t: Array
+    R_information: Array
+    t_information: Array
+
+    def __post_init__(self) -> None:
+        k = len(self.views)
+        object.__setattr__(self, "views", frozen(self.views, (k,), "PosePriors.views", np.int64))
+        for name, tail in {"R": (3, 3), "t": (3,), "R_information": (3, 3), "t_information": (3, 3)}.items():
+            object.__setattr__(self, name, _finite(getattr(self, name), (k, *tail), f"PosePriors.{name}"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconstruction:
+    """V views and P tracks in one world frame, in its unit of length.
+
+    view_ids (V,), names (V,), poses T_world_cam as R (V, 3, 3), t (V, 3), good where `estimated` (V,); stamps_ns (V,) or
+    None; camera (V,) into `cameras`. Tracks: track_ids (P,), points (P, 3), good where track_estimated (P,); track p is
+    observed by views observing_views[offsets[p] : offsets[p + 1]] (rows) at uv (M, 2) px. Raises ValueError on shapes,
+    ids named twice, rows that are not there and numbers that are not finite.
+    """
+
+    view_ids: np.ndarray
+    names: tuple[str, ...]
+    R: Array
+    t: Array
+    estimated: np.ndarray
+    track_ids: np.ndarray
+    points: Array
+    track_estimated: np.ndarray
+    offsets: np.ndarray
+    observing_views: np.ndarray
+    uv: Array
+    stamps_ns: np.ndarray | None = None
+    camera: np.ndarray | None = None
+    cameras: tuple[Camera, ...] = ()
+    priors: PosePriors | None = None
+
+    def __post_init__(self) -> None:
+        put, v, p, m = object.__setattr__, len(self.view_ids), len(self.track_ids), len(self.observing_views)
+        shapes: dict[str, tuple[tuple[int, ...], type]] = {
+            "view_ids": ((v,), np.int64),
+            "R": ((v, 3, 3), np.float64),
+            "t": ((v, 3), np.float64),
+            "estimated": ((v,), np.bool_),
+            "track_ids": ((p,), np.int64),
+            "points": ((p, 3), np.float64),
+            "track_estimated": ((p,), np.bool_),
+            "offsets": ((p + 1,), np.int64),
+            "observing_views": ((m,), np.int32),
+            "uv": ((m, 2), np.float64),
+        }
+        for name in ("stamps_ns", "camera"):
+            if getattr(self, name) is not None:
+                shapes[name] = ((v,), np.int64)
+        for name, (shape, dtype) in shapes.items():
+            where = f"Reconstruction.{name}"
+            value = getattr(self, name)
+            put(self, name, _finite(value, shape, where) if dtype is np.float64 else frozen(value, shape, where, dtype))
+        if len(self.names) != v:
+            raise ValueError(f"Reconstruction.names has {len(self.names)} entries for {v} views")
+        for name in ("view_ids", "track_ids"):
+            ids, counts = np.unique(getattr(self, name), return_counts=True)
+            if (counts > 1).any():
+                raise ValueError(f"Reconstruction.{name} has {ids[counts > 1][0]} more than once")
+        if self.offsets[0] != 0 or self.offsets[-1] != m or (np.diff(self.offsets) < 0).any():
+            raise ValueError("Reconstruction.offsets do not part the observations among the tracks")
+        self._rows("observing_views", self.observing_views, v)
+        self._rows("camera", self.camera, len(self.cameras))
+        self._rows("priors.views", None if self.priors is None else self.priors.views, v)
+
+    def _rows(self, name: str, rows: np.ndarray | None, count: int) -> None:
+        if rows is not None and len(rows) and not (rows.min() >= 0 and rows.max() < count):
+            raise ValueError(f"Reconstruction.{name} names row {rows.max()} of {count}")
+
+
+def _finite(value: Array, shape: tuple[int, ...], where: str) -> np.ndarray:
+    a = frozen(value, shape, where)
+    if not np.isfinite(a).all():
+        raise ValueError(f"{where} has a number that is not finite")
+    return a
