@@ -20,7 +20,8 @@ CHORD = 0.1  # by which a step must shrink what is left, for another with the sa
 APPROACHES, MOST_APPROACHES = 0.8, 12  # by which residuals shrink while losses are wide, and for how many steps
 STAGE_TOLERANCE = 1e-3  # on the way to another loss
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-7, 1e12
-TRUSTED_DAMPING = 1e-3  # up to it the predicted decrease is that of the undamped step
+TRUSTED_DAMPING = 1e-3  # up to it a damped step's promise is believed, where no undamped step can be had
+SHORTEST = 1 / 8  # of an undamped step that overshoots, before it is damped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,29 +77,37 @@ def descend(
 ) -> Descent:
     """Levenberg-Marquardt from where the equations stand; damping begins when a step fails (Madsen et al. 2004).
 
+    But first it is shortened: of a long chain damping stops the soft directions, where most is to gain, and what little
+    such a step promises is no sign of an end.
     Near the end the factored matrix is used on, as long as the gradient shrinks by it (chord steps).
     """
     state, cost, damping, iterations, last = start.state, start.cost, 0.0, 0, np.inf
-    curved = factored = converged = False
+    curved = factored = converged = singular = False
+    length = 1.0
     while iterations < budget and not converged and damping < MOST_DAMPING:
         iterations += 1
-        step = _step(equations, state, held, damping, factored)
+        step = _step(equations, state, held, damping, factored, length)
+        singular = singular if damping else step is None
         again, new, near, chord = factored, np.inf, False, False
         if step is not None:
             near = step[1] <= NEAR * cost
-            chord = factored or (near and not damping and step[1] <= CHORD**2 * last)
+            chord = factored or (near and not damping and length == 1 and step[1] <= CHORD**2 * last)
             new = equations.at(step[0], stages, newton=near, only_gradient=chord)
-            converged = damping <= TRUSTED_DAMPING and step[1] <= 2 * tolerance * cost + NOTHING
+            trusted = not damping or (singular and damping <= TRUSTED_DAMPING)
+            converged = trusted and step[1] <= 2 * tolerance * cost + NOTHING
         if step is not None and new <= cost:
             state, cost, last, curved = step[0], new, step[1], near
-            damping = damping / 10 if damping > LEAST_DAMPING else 0.0
+            damping, length = damping / 10 if damping > LEAST_DAMPING else 0.0, 1.0
             if chord and not converged:
                 left = _promise(equations, state, held)
                 converged, factored = left <= 2 * tolerance * cost + NOTHING, left <= CHORD * last
                 if not (converged or factored):
                     equations.at(state, stages, newton=True)
         else:
-            damping = damping if curved or again else max(10 * damping, FIRST_DAMPING)
+            if step is not None and not (curved or again or damping) and length > SHORTEST:
+                length /= 2
+            elif not (curved or again):
+                damping, length = max(10 * damping, FIRST_DAMPING), 1.0
             last, curved, factored = np.inf, False, False
             equations.at(state, stages)
     norm = float(np.linalg.norm(_projected(equations.gradient, state, held)))
@@ -106,9 +115,12 @@ def descend(
 
 
 def _step(
-    equations: Equations, state: State, held: np.ndarray, damping: float, factored: bool = False
+    equations: Equations, state: State, held: np.ndarray, damping: float, factored: bool = False, length: float = 1.0
 ) -> tuple[State, float] | None:
-    """The state after a damped Newton step and twice the decrease of cost it promises; None where there is none."""
+    """The state after `length` of a damped Newton step and twice the decrease of cost that the whole step promises.
+
+    None where there is none.
+    """
     free = ~held[:, : equations.d]
     gradient = _projected(equations.gradient, state, held)
     if not factored:
@@ -124,7 +136,7 @@ def _step(
     if not promised >= 0:
         return None
     step = step if equations.d == 7 else np.pad(step, ((0, 0), (0, 1)))
-    trial = retract(state, step, equations.local)
+    trial = retract(state, length * step, equations.local)
     np.clip(trial[2], -MAX_LOG_SCALE, MAX_LOG_SCALE, out=trial[2])
     return trial, promised
 
