@@ -62,7 +62,7 @@ def test_window_and_batch_say_the_same() -> None:
     online = window.solve(5)
     start = tuple(S0 @ k.T_odom_cam for k in keyframes)
     batch = solve(run_graph([k.id for k in keyframes], start, edges, list(anchors.items()), config), marginals=True)
-    assert online.keys == tuple(batch.keys)
-    d = (batch.S[-1].inverse() @ online.S_map_i[-1]).log()
+    assert tuple(key for key, _ in window.poses()) == tuple(batch.keys)
+    d = (batch.S[-1].inverse() @ online.S_map_i).log()
     assert np.sqrt(d @ np.linalg.solve(batch.cov[-1], d)) < 0.1  # standard deviations
     np.testing.assert_allclose(np.diag(online.cov), np.diag(batch.cov[-1]), rtol=0.1)

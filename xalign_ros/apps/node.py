@@ -224,7 +224,7 @@ class XalignNode(Node):
 def newest(keyframe: Keyframe, c: Correction) -> Estimate:
     """S_map_i of the correction's keyframe, to predict from."""
     Ad = keyframe.T_odom_cam.inverse().as_sim3().adjoint()
-    return Estimate((keyframe.id,), (c.S_map_odom @ keyframe.T_odom_cam,), keyframe.id, Ad @ c.cov_odom @ Ad.T)
+    return Estimate(keyframe.id, c.S_map_odom @ keyframe.T_odom_cam, Ad @ c.cov_odom @ Ad.T)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

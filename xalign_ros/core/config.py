@@ -69,8 +69,14 @@ class Lock:
     anchors: int = option(3, "1", "anchors that must agree under one similarity", 2, 100)
     scale_sigma: float = option(0.15, "1", "log-scale sigma above which a lock waits for more motion", 0.001, 10.0)
     chi2: float = option(22.46, "1", "gate on 6 degrees of freedom, 99.9 %", 1.0, 1000.0)
-    memory: int = option(30, "1", "keyframes that a waiting anchor is remembered", 2, 1000)
-    incumbent_cap: int = option(8, "1", "accepted anchors that count against a challenging consensus, at most", 1, 1000)
+    memory: int = option(100, "1", "keyframes that a waiting anchor is remembered", 2, 1000)
+    cap: int = option(
+        10,
+        "1",
+        "anchors of a place that would have the camera leap, which a lock withstands; one more takes over",
+        1,
+        1000,
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,9 +28,10 @@ class Witness:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """S_map_odom of a hypothesis and the indices of the witnesses that agree with it."""
+    """S_map_odom of a hypothesis with the sigma of its log-scale, and the indices of the witnesses that agree with it."""
 
     S_map_odom: Sim3
+    scale_sigma: float
     members: tuple[int, ...]
 
 
@@ -45,7 +46,7 @@ def find_consensus(witnesses: Sequence[Witness], metric: bool, config: Config) -
         return None
     newest = len(witnesses) - 1
     evidence = _Evidence.of(witnesses)
-    best: tuple[int, float, Sim3, tuple[int, ...]] | None = None
+    best: tuple[int, float, Sim3, float, tuple[int, ...]] | None = None
     for other in range(newest):
         hypothesis = _similarity(witnesses[other], witnesses[newest], metric)
         if hypothesis is None:
@@ -55,11 +56,23 @@ def find_consensus(witnesses: Sequence[Witness], metric: bool, config: Config) -
         members = tuple(int(n) for n in np.flatnonzero(chi2 < config.lock.chi2))
         score = (len(members), -float(chi2[list(members)].sum()))
         if newest in members and (best is None or score > best[:2]):
-            best = (*score, S, members)
+            best = (*score, S, scale_sigma, members)
     if best is None or best[0] < config.lock.anchors:
         return None
-    S = _fit(best[2], [witnesses[n] for n in best[3]], metric)
-    return Consensus(S, best[3])
+    S = _fit(best[2], [witnesses[n] for n in best[4]], metric)
+    return Consensus(S, best[3], best[4])
+
+
+def joins(consensus: Consensus, first: Witness, estimates: Sequence[Witness], config: Config) -> bool:
+    """Whether one of the estimates, poses as they are believed up to a consensus' first member, agrees with it, too.
+
+    Then one odometry leads from the belief to the consensus, if with another scale from there on; else the camera would
+    have to leap while its odometry ran on smoothly.
+    """
+    if not estimates:
+        return False
+    chi2 = _chi2(consensus.S_map_odom, consensus.scale_sigma, _Evidence.of([*estimates, first]), config)
+    return bool(chi2[:-1].min() < config.lock.chi2)
 
 
 def _similarity(a: Witness, b: Witness, metric: bool) -> tuple[Sim3, float] | None:

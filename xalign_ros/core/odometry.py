@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from xalign_ros.core.config import Odometry
@@ -9,6 +11,8 @@ from xalign_ros.core.lie import Array
 from xalign_ros.core.records import Estimate, Keyframe, RelativePose
 from xalign_ros.core.transforms import SE3, Sim3
 
+LEAP_RATIO = 3.0  # of a step over the largest of the last ones, beyond which the odometry leapt rather than moved
+LEAP_M, LEAP_RAD = 0.5, 0.3  # and at least this far
 METRIC_WALK = 0.1  # part of metric_scale_sigma that a metric odometry's scale may wander per sqrt(m)
 
 
@@ -32,9 +36,28 @@ def edge_between(i: Keyframe, j: Keyframe, scale: float, config: Odometry) -> Re
     return RelativePose(i.id, j.id, T_i_j, np.sqrt(variance))
 
 
+def step_size(T_i_j: SE3) -> tuple[float, float]:
+    """Length (odometry units) and angle (rad) of a step."""
+    return float(np.linalg.norm(T_i_j.t)), float(np.arccos(np.clip((np.trace(T_i_j.R) - 1) / 2, -1, 1)))
+
+
+def with_leap(edge: RelativePose, earlier: Sequence[tuple[float, float]], scale: float) -> RelativePose:
+    """The edge, or, where its step is out of all proportion to the `earlier` ones, one that says next to nothing.
+
+    An odometry that lost its tracks leaps, by an amount that is no measurement: its sigmas are raised to that amount.
+    """
+    if len(earlier) < 2:
+        return edge
+    length, angle = step_size(edge.T_i_j)
+    usual = np.max(earlier, axis=0)
+    if length <= max(LEAP_RATIO * usual[0], LEAP_M / scale) and angle <= max(LEAP_RATIO * usual[1], LEAP_RAD):
+        return edge
+    return RelativePose(edge.i, edge.j, edge.T_i_j, np.maximum(edge.sigmas, np.r_[[angle] * 3, [length] * 3, 0.0]))
+
+
 def predict(solution: Estimate, edge: RelativePose) -> tuple[Sim3, Array]:
     """S_map_j and its covariance (7, 7) from the newest node of a solution and an edge: S_i Z, Ad(Z^-1) C Ad^T + Q."""
-    S = solution.S_map_i[-1] @ edge.T_i_j
+    S = solution.S_map_i @ edge.T_i_j
     Ad = edge.T_i_j.inverse().as_sim3().adjoint()
     cov = Ad @ solution.cov @ Ad.T + np.diag(edge.sigmas**2)
     return S, (cov + cov.T) / 2

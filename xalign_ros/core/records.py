@@ -165,11 +165,10 @@ class RelativePose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """Estimates S_map_i of `keys`; cov (7, 7) is of `cov_key`, tangent rotation, translation (odometry units), log-scale."""
+    """S_map_i of the newest keyframe `key` with cov (7, 7): rotation, translation (odometry units), log-scale."""
 
-    keys: tuple[int, ...]
-    S_map_i: tuple[Sim3, ...]
-    cov_key: int
+    key: int
+    S_map_i: Sim3
     cov: Array
 
     def __post_init__(self) -> None:

@@ -38,6 +38,7 @@ class Window:
         self._pending.push_back(prior_factor(*first_prior(S_map_first, metric, config)))
         self._values.insert(0, to_gtsam(S_map_first))
         self._newest = S_map_first
+        self._unsettled = True
 
     def __len__(self) -> int:
         return len(self._ids)
@@ -54,9 +55,10 @@ class Window:
     def attach(self, anchor: Anchor, back: int = 0) -> None:
         """Add an anchor to the keyframe `back` places behind the newest."""
         self._pending.push_back(anchor_factor(anchor, self._key - back, self._newest.s, self._huber))
+        self._unsettled = True
 
     def solve(self, extra_updates: int = SETTLE_UPDATES) -> Estimate | None:
-        """Update with all that was added; the covariance is the newest keyframe's.
+        """Update with all that was added; `extra_updates` only where an anchor was. The newest keyframe's estimate.
 
         None where the numbers do not allow it (an odometry that leaps by thousands of kilometres); the window is spent then.
         """
@@ -64,20 +66,28 @@ class Window:
         stamps = {key: float(key) for key in keys}
         try:
             self._smoother.update(self._pending, self._values, stamps)
-            for _ in range(extra_updates):
+            for _ in range(extra_updates if self._unsettled else 0):
                 self._smoother.update()
-            estimate = self._smoother.calculateEstimate()
+            newest = from_gtsam(self._smoother.calculateEstimateSimilarity3(self._key))
             cov = self._smoother.marginalCovariance(self._key)
-            keys = sorted(estimate.keys())
-            poses = tuple(from_gtsam(estimate.atSimilarity3(k)) for k in keys)
         except (RuntimeError, ValueError):  # an indeterminate system; a scale that is none
             return None
-        if not (np.isfinite(cov).all() and np.isfinite(poses[-1].t).all()):
+        if not (np.isfinite(cov).all() and np.isfinite(newest.t).all()):
             return None
         self._pending.resize(0)
         self._values.clear()
-        self._newest = poses[-1]
-        return Estimate(tuple(self._ids[-len(keys) :]), poses, self._ids[-1], (cov + cov.T) / 2)
+        self._unsettled = False
+        self._newest = newest
+        return Estimate(self._ids[-1], newest, (cov + cov.T) / 2)
+
+    def poses(self) -> tuple[tuple[int, Sim3], ...]:
+        """All keyframes of the window, id and S_map_i, as solved last, newest last."""
+        estimate = self._smoother.calculateEstimate()
+        keys = sorted(estimate.keys())
+        return tuple(
+            (id_, from_gtsam(estimate.atSimilarity3(key)))
+            for id_, key in zip(self._ids[-len(keys) :], keys, strict=True)
+        )
 
 
 def first_prior(S_map_first: Sim3, metric: bool, config: Config) -> tuple[Sim3, int, Array]:

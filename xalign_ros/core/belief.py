@@ -1,0 +1,233 @@
+"""Which anchors are believed, and where that puts the run.
+
+The window is the belief. An anchor inside its drift budget joins it; one outside waits. Anchors that wait and agree with
+the odometry between them are a party. A party of lock.anchors makes the first lock, and takes over later if it joins on
+to the belief, which says that the odometry drifted or its scale broke and the anchors are right. A party that would have
+the camera leap while the odometry ran on smoothly looks like another place: a lock withstands lock.cap of it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from xalign_ros.core.config import Config
+from xalign_ros.core.consensus import Consensus, Witness, find_consensus, joins
+from xalign_ros.core.lie import Array
+from xalign_ros.core.odometry import edge_between, pose_covariance, predict, step_size, with_leap
+from xalign_ros.core.records import Anchor, Estimate, Keyframe, Rejection, RelativePose, State
+from xalign_ros.core.status import judge
+from xalign_ros.core.transforms import SE3, Sim3
+from xalign_ros.core.window import Window
+
+LOCK_UPDATES = 3  # smoother updates until a window that starts from a consensus has settled
+PARTY_REACH = 12  # waiting anchors among which the newest looks for its like; the odometry to older ones says little
+STEPS = 10  # of the odometry that say what a step of it is like
+
+WAITS = "it waits for others that agree with it"
+
+Prediction = tuple[Sim3, Array]  # S_map_i and its covariance (7, 7)
+
+
+@dataclass(slots=True)
+class _Link:
+    """A keyframe of the running session as it is remembered: what it saw, and what became of that."""
+
+    keyframe: Keyframe
+    path: float  # odometry units since the session began
+    edge: RelativePose | None  # from the link before
+    anchor: Anchor | None = None
+    accepted: bool = False
+    party: int = -1  # of a waiting anchor that others agree with
+    belief: tuple[SE3, Array] | None = None  # T_map_cam and covariance (6, 6), as believed at this keyframe
+
+
+class Belief:
+    """One session after the other of keyframes and their anchors; `extend`, then `judge`, once per keyframe."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.begin(State.UNINITIALIZED, "no anchor was found yet")
+
+    def begin(self, state: State, reason: str) -> None:
+        """Nothing that was learnt about the last session's frame holds for the next one's."""
+        self._links: deque[_Link] = deque(maxlen=self.config.lock.memory)
+        self._steps: deque[tuple[float, float]] = deque(maxlen=STEPS)
+        self._window: Window | None = None
+        self._anchored: _Link | None = None  # the last keyframe whose anchor was accepted
+        self._parties = 0
+        self.estimate: Estimate | None = None
+        self.unlocked = state, reason
+
+    @property
+    def keyframes(self) -> list[Keyframe]:
+        """Of this session, as far as they are remembered, oldest first."""
+        return [link.keyframe for link in self._links]
+
+    def poses(self) -> tuple[tuple[int, SE3], ...]:
+        """Of the window, T_map_cam by keyframe id, newest last; none without a lock."""
+        return tuple((key, S.rigid_pose()) for key, S in self._window.poses()) if self._window else ()
+
+    @property
+    def waiting(self) -> int:
+        return sum(link.anchor is not None for link in self._links)
+
+    def __len__(self) -> int:
+        """Keyframes in the window."""
+        return len(self._window) if self._window else 0
+
+    def extend(self, keyframe: Keyframe) -> Prediction | None:
+        """Take the next keyframe of the session; where it should be, if the session is locked."""
+        edge = None
+        if self._links:
+            edge = edge_between(self._links[-1].keyframe, keyframe, self.scale, self.config.odometry)
+            edge = with_leap(edge, self._steps, self.scale)
+            self._steps.append(step_size(edge.T_i_j))
+        path = self._links[-1].path + float(np.linalg.norm(edge.T_i_j.t)) if edge else 0.0
+        self._links.append(_Link(keyframe, path, edge))
+        return predict(self.estimate, edge) if self.estimate and edge else None
+
+    def judge(
+        self, found: Anchor | Rejection, predicted: Prediction | None
+    ) -> tuple[Anchor | Rejection, tuple[Anchor, ...]]:
+        """Take what was found at the keyframe: believe it, keep it waiting, or let it turn the belief.
+
+        Gives what it stands as now, and the earlier anchors that are believed with it.
+        """
+        link = self._links[-1]
+        believed: tuple[Anchor, ...] = ()
+        found = self._within_budget(found, predicted)
+        if self._window is not None and link.edge is not None:
+            self._window.extend(link.edge)
+            if isinstance(found, Anchor):
+                self._window.attach(found)
+            self.estimate = self._window.solve()
+            if self.estimate is None:
+                found = self._give_up(found)
+        if isinstance(found, Rejection) and found.anchor is not None and found.anchor is link.anchor:
+            found, believed = self._challenge(found)
+        if isinstance(found, Anchor):
+            link.accepted = True
+            self._anchored = link
+        if self.estimate is not None:
+            link.belief = self.estimate.S_map_i.rigid_pose(), self.pose_cov
+        return found, believed
+
+    # -- the estimate --------------------------------------------------------------------------------------------
+
+    @property
+    def scale(self) -> float:
+        return self.estimate.S_map_i.s if self.estimate else 1.0
+
+    @property
+    def pose_cov(self) -> Array:
+        """Covariance (6, 6) of the newest keyframe's pose."""
+        assert self.estimate is not None
+        return pose_covariance(self.estimate.S_map_i, self.estimate.cov)
+
+    @property
+    def since_anchor(self) -> tuple[float, float]:
+        """Time (s) and distance (m) of the newest keyframe since the last accepted anchor; NaN before the first."""
+        if self._anchored is None:
+            return float("nan"), float("nan")
+        newest = self._links[-1]
+        seconds = (newest.keyframe.stamp_ns - self._anchored.keyframe.stamp_ns) / 1e9
+        return seconds, (newest.path - self._anchored.path) * self.scale
+
+    def judged(self, cov_cam: Array) -> tuple[State, str]:
+        return judge(cov_cam, *self.since_anchor, self.config.status)
+
+    # -- parts of a judgement, in order --------------------------------------------------------------------------
+
+    def _within_budget(self, found: Anchor | Rejection, predicted: Prediction | None) -> Anchor | Rejection:
+        """Refuse an anchor that the odometry cannot have drifted to; it is remembered as a challenger."""
+        if isinstance(found, Rejection):
+            return found
+        self._links[-1].anchor = found
+        if predicted is None or self.judged(pose_covariance(*predicted))[0] is State.LOST:
+            return _refused(found, "inconsistent", WAITS)
+        S, cov = predicted
+        error = (found.T_map_cam.inverse() @ S.rigid_pose()).log()
+        chi2 = float(error @ np.linalg.solve(pose_covariance(S, cov) + found.cov_cam, error))
+        if chi2 < self.config.lock.chi2:
+            return found
+        off = float(np.linalg.norm(error[3:]))
+        return _refused(
+            found, "drift_budget", f"it is {off:.2f} m off the prediction: {chi2:.0f} > {self.config.lock.chi2:g}"
+        )
+
+    def _give_up(self, found: Anchor | Rejection) -> Anchor | Rejection:
+        """Go on without a window where the odometry has leapt further than numbers reach; an anchor waits for others."""
+        self._window = self._anchored = None
+        self.unlocked = State.LOST, "the odometry leapt further than the window can follow"
+        return _refused(found, "inconsistent", WAITS) if isinstance(found, Anchor) else found
+
+    def _challenge(self, found: Rejection) -> tuple[Anchor | Rejection, tuple[Anchor, ...]]:
+        """Find the newest waiting anchor's party, and let it take over if it may."""
+        assert found.anchor is not None
+        waiting = [link for link in self._links if link.anchor is not None and not link.accepted][-PARTY_REACH:]
+        consensus = find_consensus(_witnesses(waiting), waiting[-1].keyframe.metric_scale, self.config)
+        if consensus is None:
+            return found, ()
+        agreeing = [waiting[n] for n in consensus.members]
+        party = self._united(agreeing)
+        if not self._may_take_over(consensus, agreeing, party) or not self._lock(consensus, party):
+            return found, ()
+        return found.anchor, tuple(link.anchor for link in party[:-1] if link.anchor)
+
+    def _united(self, agreeing: list[_Link]) -> list[_Link]:
+        """All links of the parties to which these belong, as one party from now on."""
+        merged = {link.party for link in agreeing} - {-1}
+        self._parties += 1
+        party = [k for k in self._links if not k.accepted and (k.party in merged or any(k is a for a in agreeing))]
+        for link in party:
+            link.party = self._parties
+        return party
+
+    def _may_take_over(self, consensus: Consensus, agreeing: list[_Link], party: list[_Link]) -> bool:
+        if self._window is None or len(party) > self.config.lock.cap:
+            return True
+        links = list(self._links)
+        last = next((n for n, link in enumerate(links) if link is self._anchored), 0)
+        first = next(n for n, link in enumerate(links) if link is agreeing[0])
+        between = [link for link in links[last : first + 1] if link.belief is not None]
+        estimates = [
+            Witness(Anchor(k.keyframe.id, 0, 0, *k.belief, 0, 0, 0.0), k.keyframe.T_odom_cam, k.path)
+            for k in between
+            if k.belief is not None
+        ]
+        return joins(consensus, _witnesses(agreeing[:1])[0], estimates, self.config)
+
+    def _lock(self, consensus: Consensus, members: list[_Link]) -> bool:
+        """Start the window anew over the links since the first member; False while that cannot tell the scale."""
+        member = {id(link) for link in members}
+        links = list(self._links)
+        links = links[[id(link) for link in links].index(id(members[0])) :]
+        S, first = consensus.S_map_odom, links[0].keyframe
+        window = Window(S @ first.T_odom_cam, first.id, first.metric_scale, self.config)
+        for n, link in enumerate(links):
+            if n and link.edge is not None:
+                edge = edge_between(links[n - 1].keyframe, link.keyframe, S.s, self.config.odometry)
+                window.extend(edge)
+            if link.anchor is not None and id(link) in member:
+                window.attach(link.anchor)
+        estimate = window.solve(LOCK_UPDATES)
+        if estimate is None or np.sqrt(estimate.cov[6, 6]) > self.config.lock.scale_sigma:
+            return False
+        for link in self._links:
+            link.accepted = id(link) in member
+            link.party = -1
+        self._window, self.estimate = window, estimate
+        return True
+
+
+def _witnesses(links: Sequence[_Link]) -> list[Witness]:
+    return [Witness(link.anchor, link.keyframe.T_odom_cam, link.path) for link in links if link.anchor]
+
+
+def _refused(anchor: Anchor, reason: str, detail: str) -> Rejection:
+    who = (anchor.keyframe_id, anchor.session, anchor.stamp_ns)
+    return Rejection(*who, reason, detail, anchor.matches, anchor.inliers, anchor.rms_px, anchor.runner_up, anchor)
