@@ -62,7 +62,8 @@ check: $(STAMP)
 	$(VENV)/bin/mypy
 
 bench: $(STAMP)
-	$(PY) bench/main_job.py
+	$(PY) -m pip install -q pytheia==1.2.1
+	$(PY) bench/main_job.py; main=$$?; $(PY) bench/graph.py && exit $$main
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info demo_report .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,9 +1,14 @@
 """The pose-graph engine beside pyTheia and GTSAM; exit 1 on a miss. bench/graph.py [--only NAME] [--json].
 
-Names: golden, pytheia_50, pytheia_500, pytheia_5000, pytheia_50000, million, covariance.
+Names: golden, pytheia_50, pytheia_500, pytheia_5000, pytheia_50000, million, covariance, invariance, g2o, warp, window,
+online (half an hour on two cores, the others ten minutes together).
 """
 
 from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as GTSAM's wheel and pyTheia have it; before NumPy is imported
 
 import resource
 import statistics
@@ -16,14 +21,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 from case import Case, run
-from graph_problems import CAUCHY, drifting, golden, monocular
+from graph_problems import CAUCHY, DATA, drifting, golden, monocular
+from online import online, window
 
 from xalign_ros.core import lie
 from xalign_ros.core.graph import Solution, solve
+from xalign_ros.core.graph_chordal import chordal
 from xalign_ros.core.pose_graph import Loss, PoseGraph
+from xalign_ros.core.warp import warp_points
+from xalign_ros.io.g2o import read_g2o
 
+OPTIMA = {
+    "sphere2500": 675.701,
+    "parking-garage": 0.634192,
+    "smallGrid3D": 517.925,
+    "tinyGrid3D": 9.31391,
+    "Klaus3": 0.007028,
+}
 PEER = Path(__file__).with_name("pytheia_peer.py")
 ITERATIONS = 50  # pyTheia's default
 # N: times faster than pyTheia, clean and with 10 % outliers; RMSE of centres (m) at most, likewise.
@@ -122,6 +139,86 @@ def million_alone() -> None:
     print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, error)
 
 
+def invariance(case: Case) -> None:
+    """The map moved, turned and scaled with its anchors; the odometry scaled with its sigmas."""
+    worst = {"map": 0.0, "odometry": 0.0}
+    for seed in range(20):
+        graph, _ = drifting(50, seed)
+        assert graph.odometry is not None and graph.anchors is not None
+        R, t, s = (x[0] for x in lie.sim3_exp(np.random.default_rng(seed).normal(size=(1, 7))))
+        cost = solve(graph, max_iterations=0).cost
+        unit = np.r_[np.ones(3), np.full(3, 1 / s), 1.0]
+        anchors = replace(
+            graph.anchors,
+            R=R @ graph.anchors.R,
+            t=s * graph.anchors.t @ R.T + t,
+            information=unit[:, None] * graph.anchors.information * unit,
+        )
+        moved = replace(graph, R=R @ graph.R, t=s * graph.t @ R.T + t, s=s * graph.s, anchors=anchors)
+        worst["map"] = max(worst["map"], abs(solve(moved, max_iterations=0).cost / cost - 1))
+        odometry = replace(graph.odometry, t=s * graph.odometry.t, sigmas=graph.odometry.sigmas / unit)
+        scaled = replace(graph, s=graph.s / s, odometry=odometry)
+        worst["odometry"] = max(worst["odometry"], abs(solve(scaled, max_iterations=0).cost / cost - 1))
+    for frame, change in worst.items():
+        case.figure(f"relative change of the cost with the frame of the {frame}", change, high=1e-9)
+
+
+def g2o(case: Case) -> None:
+    """Optima in GTSAM's objective; times of both solvers from the same chordal start, turn by turn."""
+    for name, optimum in OPTIMA.items():
+        path = DATA / "g2o" / f"{name}.g2o"
+        graph = chordal(read_g2o(path, "angle").graph)
+        factors, _ = gtsam.readG2o(str(path), True)
+        held = gtsam.NonlinearFactorGraph(factors)
+        start = values_of(graph.keys, graph.R, graph.t)
+        first = int(graph.keys[0])
+        held.push_back(gtsam.PriorFactorPose3(first, start.atPose3(first), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
+        ours, theirs = [], []
+        for _ in range(9):
+            begin = time.perf_counter()
+            solution = solve(graph)
+            ours.append(time.perf_counter() - begin)
+            begin = time.perf_counter()
+            gtsam.LevenbergMarquardtOptimizer(held, start, gtsam.LevenbergMarquardtParams()).optimize()
+            theirs.append(time.perf_counter() - begin)
+        cost = factors.error(values_of(graph.keys, solution.R, solution.t))
+        case.figure(f"{name}: cost in GTSAM's objective", cost, high=optimum * (1 + 1e-4))
+        case.figure(f"{name}: ms", 1e3 * statistics.median(ours))
+        case.figure(f"{name}: peer: GTSAM LM, ms", 1e3 * statistics.median(theirs))
+        ratio = statistics.median(ours) / statistics.median(theirs)
+        limit = 1.0 if name in ("sphere2500", "parking-garage") else np.inf
+        case.figure(f"{name}: our time over GTSAM's", ratio, high=limit)
+
+
+def values_of(keys: np.ndarray, R: np.ndarray, t: np.ndarray) -> Any:
+    values = gtsam.Values()
+    for k, R_k, t_k in zip(keys.tolist(), R, t, strict=True):
+        values.insert(k, gtsam.Pose3(gtsam.Rot3(R_k), t_k))
+    return values
+
+
+def warp(case: Case) -> None:
+    """A million points with five observations each; the peer's way is every observation's own similarity."""
+    rng, count, views = np.random.default_rng(0), 1_000_000, 5000
+    first = np.sort(rng.integers(0, views - 5, count))
+    seen = (first[:, None] + np.arange(5)).ravel().astype(np.int32)
+    offsets, points = np.arange(0, 5 * count + 1, 5), rng.normal(0, 50, (count, 3))
+    R, t, s = lie.sim3_exp(0.05 * rng.normal(size=(views, 7)))
+    taken = []
+    for _ in range(9):
+        begin = time.perf_counter()
+        moved = warp_points(points, offsets, seen, (R, t, s), np.ones(views, bool))
+        taken.append(time.perf_counter() - begin)
+    part = slice(0, 100_000)
+    begin = time.perf_counter()
+    k = seen.reshape(-1, 5)[part]
+    each = s[k][..., None] * np.einsum("pkij,pj->pki", R[k], points[part]) + t[k]
+    direct = each.mean(axis=1)
+    case.figure("ms", 1e3 * statistics.median(taken), high=90)
+    case.figure("peer: observation by observation, ms", 1e4 * (time.perf_counter() - begin))
+    case.figure("largest difference of the two, m", np.abs(moved[part] - direct).max(), high=1e-9)
+
+
 def covariance(case: Case) -> None:
     for n, seeds in ((50, 100), (500, 100), (50_000, 20)):
         means = []
@@ -142,6 +239,11 @@ CASES: dict[str, Callable[[Case], None]] = {
     **{f"pytheia_{n}": beside_pytheia(n) for n in PYTHEIA},
     "million": million,
     "covariance": covariance,
+    "invariance": invariance,
+    "g2o": g2o,
+    "warp": warp,
+    "window": window,
+    "online": online,
 }
 
 if __name__ == "__main__":

@@ -583,6 +583,22 @@ def test_a_scale_that_breaks_is_followed_at_the_third_anchor(evidence):
     assert np.nanmax(error[36:]) < 0.3
 
 
+def test_a_jump_can_be_published_by_parts(evidence):
+    """The lock on another place is given up at once, but told by and by, and the covariance says so."""
+    drive = Drive(60, 1)
+    for n in range(6):
+        drive.anchors[n] = drive.anchor(n, LIE @ drive.truth[n])
+    at_once, parted = (evidence(drive, config=with_options(SHORT, {"output.blend": b}, "test")) for b in (1.0, 0.3))
+    sudden, slow = (position_errors(steps, drive.truth) for steps in (at_once, parted))
+    n = int(np.nanargmax(-np.diff(sudden))) + 1
+    assert sudden[n] < 0.15 and slow[n] == pytest.approx(0.7 * slow[n - 1], rel=0.2)
+    assert slow[n] > slow[n + 1] > slow[n + 2] and slow[n + 20] < 0.2
+    assert np.sqrt(np.trace(parted[n].correction.cov_cam[3:, 3:])) > 0.9 * slow[n]
+    assert nees(parted[n].correction, drive.truth[n]) < 10
+    same_before = [same(a.correction, b.correction) for a, b in zip(at_once[:3], parted[:3], strict=True)]
+    assert all(same_before)
+
+
 def test_an_odometry_that_diverges_ends_lost_and_not_in_an_exception(evidence):
     drive = Drive(60, 1)
     for n in range(20, 60):

@@ -20,7 +20,9 @@ from xalign_ros.core.records import (
     Step,
 )
 from xalign_ros.core.reference_map import MapIndex, ReferenceMap
+from xalign_ros.core.smoothing import eased
 from xalign_ros.core.status import score
+from xalign_ros.core.transforms import Sim3
 
 
 class Aligner:
@@ -30,6 +32,7 @@ class Aligner:
         self.config = config or Config()
         self.index = MapIndex(map_)
         self.belief = Belief(self.config)
+        self._published: Sim3 | None = None  # the last S_map_odom, for a jump to start from
         self._counts = {"keyframes": 0, "accepted": 0, "rejected": 0}
 
     def step(self, keyframe: Keyframe | None, fault: Rejection | None = None) -> Step:
@@ -45,6 +48,7 @@ class Aligner:
         earlier = self.belief.keyframes
         if earlier and begins_session(keyframe, earlier[-1]):
             self.belief.begin(State.LOST, f"the odometry began session {keyframe.session}")
+            self._published = None
             earlier = []
         refused = refusal(keyframe, earlier, self.index.map)
         if refused is not None and not carries_pose(refused):
@@ -66,13 +70,25 @@ class Aligner:
         return anywhere if isinstance(anywhere, Anchor) else found
 
     def _correction(self, keyframe: Keyframe) -> Correction | None:
-        """The newest keyframe's answer, unless the alignment is not locked or lost."""
-        if self.belief.estimate is None or self.belief.judged(self.belief.pose_cov)[0] is State.LOST:
+        """The newest keyframe's answer, unless the alignment is not locked or lost.
+
+        Where a jump is published by parts, what is kept back of it is in the covariance.
+        """
+        estimate, before = self.belief.estimate, self._published
+        self._published = None
+        if estimate is None or self.belief.judged(self.belief.pose_cov)[0] is State.LOST:
             return None
-        S_map_odom, cov = odom_in_map(self.belief.estimate.S_map_i, self.belief.estimate.cov, keyframe.T_odom_cam)
-        T_map_cam = self.belief.estimate.S_map_i.rigid_pose()
+        S_map_i, cov, share = estimate.S_map_i, estimate.cov, self.config.output.blend
+        if before is not None and share < 1:
+            S_map_i = (
+                eased(before, S_map_i @ keyframe.T_odom_cam.inverse(), keyframe.T_odom_cam, share) @ keyframe.T_odom_cam
+            )
+            behind = (S_map_i.inverse() @ estimate.S_map_i).log()
+            cov = cov + np.outer(behind, behind)
+        S_map_odom, cov_odom = odom_in_map(S_map_i, cov, keyframe.T_odom_cam)
+        self._published = S_map_odom
         who = (keyframe.id, keyframe.session, keyframe.stamp_ns)
-        return Correction(*who, S_map_odom, cov, T_map_cam, self.belief.pose_cov)
+        return Correction(*who, S_map_odom, cov_odom, S_map_i.rigid_pose(), pose_covariance(S_map_i, cov))
 
     def _step(
         self,

@@ -99,6 +99,19 @@ class Status:
 
 
 @dataclass(frozen=True, slots=True)
+class Output:
+    """What is made of the estimate last of all."""
+
+    blend: float = option(
+        1.0,
+        "1",
+        "part of a jump of the correction that is published at its keyframe; 1 publishes the estimate",
+        0.01,
+        1.0,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The whole tree."""
 
@@ -108,6 +121,7 @@ class Config:
     lock: Lock = field(default_factory=Lock)
     window: Window = field(default_factory=Window)
     status: Status = field(default_factory=Status)
+    output: Output = field(default_factory=Output)
 
 
 def options(config: Config) -> Iterator[tuple[str, Value, Field[Any]]]:
