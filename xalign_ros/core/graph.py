@@ -23,7 +23,7 @@ class Solution:
     """Estimates R (N, 3, 3), t (N, 3), s (N,) of the nodes `keys`, and how good they are.
 
     Costs are half chi-squares with the robust losses in them. `converged`: the last step, undamped, promised less than
-    a 1e-7th of the cost. `gradient_norm`: length of the cost's gradient to rotations (rad) and translations in the
+    3e-7 of the cost. `gradient_norm`: length of the cost's gradient to rotations (rad) and translations in the
     common frame and log-scales. `gauge`: what had to be held for want of absolute evidence, "" if nothing. cov
     (N, 7, 7), where asked for: marginals, right tangent (rotation, translation in units of the node, log-scale).
     """

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xalign_ros.core.graph_losses import Stage, weigh
 from xalign_ros.core.lie import Array, quat_from_rotation
 from xalign_ros.core.pose_graph import OdometryEdges
 
@@ -34,9 +33,11 @@ class Chain:
 
     @staticmethod
     def of(edges: OdometryEdges, nodes: int) -> Chain | None:
-        """None where the edges are no chain in order of the nodes, or have noise that differs by direction."""
+        """None where the edges are no chain in order of the nodes, have a robust loss, or noise that differs by direction."""
         v = edges.sigmas
         alike = (v[:, 0] == v[:, 1]) & (v[:, 0] == v[:, 2]) & (v[:, 3] == v[:, 4]) & (v[:, 3] == v[:, 5])
+        if edges.loss.name != "none":
+            return None
         if not ((edges.j == edges.i + 1).all() and (np.diff(edges.i) > 0).all() and alike.all()):
             return None
         q, t, w = np.zeros((4, nodes - 1)), np.zeros((3, nodes - 1)), np.zeros((3, nodes - 1))
@@ -45,14 +46,14 @@ class Chain:
         w[:, edges.i] = 1 / v[:, [0, 3, 6]].T ** 2  # where an edge is missing there is no information
         return Chain(q, t, *w)
 
-    def add(self, state: State, stage: Stage, band: Array | None, gradient: Array) -> float:
+    def add(self, state: State, band: Array | None, gradient: Array) -> float:
         """Cost; its gradient is added to (N, 7), its matrix to band (N, 7, >= 14), [n, c, k] = H[7 n + c + k, 7 n + c]."""
         cost, edges = 0.0, self.q.shape[1]
         for start in range(0, edges, CHUNK):
-            cost += self._add(slice(start, min(start + CHUNK, edges)), state, stage, band, gradient)
+            cost += self._add(slice(start, min(start + CHUNK, edges)), state, band, gradient)
         return cost
 
-    def _add(self, i: slice, state: State, stage: Stage, band: Array | None, gradient: Array) -> float:
+    def _add(self, i: slice, state: State, band: Array | None, gradient: Array) -> float:
         q, p, sigma = state
         j = slice(i.start + 1, i.stop + 1)
         q_j, shrink = q[:, j], np.exp(-sigma[i])
@@ -63,11 +64,7 @@ class Chain:
         r_scale = sigma[j] - sigma[i]
         wr, wt, ws = self.per_rotation[i], self.per_translation[i], self.per_scale[i]
         chi2 = wr * (r * r).sum(axis=0) + wt * (e * e).sum(axis=0) + ws * r_scale * r_scale
-        if stage[0].name == "none":
-            cost = float(chi2.sum()) / 2
-        else:
-            w, rho = weigh(stage, chi2)
-            cost, wr, wt, ws = float(rho.sum()), w * wr, w * wt, w * ws
+        cost = float(chi2.sum()) / 2
         g_i, g_j = gradient[i], gradient[j]
         wi, wu = wt * shrink, wt * u
         turn, push, pull = (wr * _rotate(q_j, r)).T, (wi * e).T, ws * r_scale

@@ -85,7 +85,7 @@ class Equations:
             self.system.clear()
         if self._chain is not None:
             band = None if only_gradient else self._band
-            self.costs["odometry"] = self._chain.add(state, stages["odometry"], band, self.gradient)
+            self.costs["odometry"] = self._chain.add(state, band, self.gradient)
         for kind in self._kinds:
             self.costs[kind.name] = self._add(kind, state, stages[kind.name], newton, only_gradient)
         return sum(self.costs.values())
