@@ -5,6 +5,10 @@ bench/online.py [SEEDS] prints the whole table alone (20 seeds take half an hour
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # two processes, two cores; before NumPy is imported
+
 import resource
 import sys
 import time

@@ -84,17 +84,17 @@ class SlidingWindow:
         self.s, self.last = np.r_[self.s, self.s[-1]], k
         if k not in self.w.at:
             return
-        weights = self.policy(self)
+        anchors, weights = self.anchors, self.policy(self)
         while len(self.t) > WINDOW:
-            self._leave(weights)
+            self._leave(dict(zip(anchors, weights, strict=True)))
 
-    def _leave(self, weights: Array) -> None:
+    def _leave(self, weights: dict[int, float]) -> None:
         """The first node's marginal becomes the prior of the second."""
         nodes = self.R[:2], self.t[:2], np.log(self.s[:2])
         one, two = (tuple(x[:1] for x in nodes), tuple(x[1:] for x in nodes))
         H, g = 1e-9 * np.eye(14), np.zeros(14)
         blocks: list[tuple[Anchors, float]] = [(self.prior, 1.0)] if self.prior is not None else []
-        for m, weight in zip(self.anchors, weights, strict=True):
+        for m, weight in weights.items():
             if self.w.at[m] == self.first:
                 blocks.append(
                     (Anchors([0], self.w.R_a[[m]], self.w.t_a[[m]], [1.0], self.anchor_information[None]), weight)

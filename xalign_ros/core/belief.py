@@ -39,6 +39,7 @@ class _Link:
     keyframe: Keyframe
     path: float  # odometry units since the session began
     edge: RelativePose | None  # from the link before
+    leapt: bool = False  # its step is no measurement
     anchor: Anchor | None = None
     accepted: bool = False
     party: int = -1  # of a waiting anchor that others agree with
@@ -81,13 +82,14 @@ class Belief:
 
     def extend(self, keyframe: Keyframe) -> Prediction | None:
         """Take the next keyframe of the session; where it should be, if the session is locked."""
-        edge = None
+        edge, leapt, path = None, False, 0.0
         if self._links:
-            edge = edge_between(self._links[-1].keyframe, keyframe, self.scale, self.config.odometry)
-            edge = with_leap(edge, self._steps, self.scale)
+            last = self._links[-1]
+            measured = edge_between(last.keyframe, keyframe, self.scale, self.config.odometry)
+            edge = with_leap(measured, self._steps, self.scale)
             self._steps.append(step_size(edge.T_i_j))
-        path = self._links[-1].path + float(np.linalg.norm(edge.T_i_j.t)) if edge else 0.0
-        self._links.append(_Link(keyframe, path, edge))
+            leapt, path = edge is not measured, last.path + self._steps[-1][0]
+        self._links.append(_Link(keyframe, path, edge, leapt))
         return predict(self.estimate, edge) if self.estimate and edge else None
 
     def judge(
@@ -210,8 +212,8 @@ class Belief:
         window = Window(S @ first.T_odom_cam, first.id, first.metric_scale, self.config)
         for n, link in enumerate(links):
             if n and link.edge is not None:
-                edge = edge_between(links[n - 1].keyframe, link.keyframe, S.s, self.config.odometry)
-                window.extend(edge)
+                anew = edge_between(links[n - 1].keyframe, link.keyframe, S.s, self.config.odometry)
+                window.extend(link.edge if link.leapt else anew)
             if link.anchor is not None and id(link) in member:
                 window.attach(link.anchor)
         estimate = window.solve(LOCK_UPDATES)

@@ -11,7 +11,7 @@ from xalign_ros.core.lie import Array
 from xalign_ros.core.records import Estimate, Keyframe, RelativePose
 from xalign_ros.core.transforms import SE3, Sim3
 
-LEAP_RATIO = 3.0  # of a step over the largest of the last ones, beyond which the odometry leapt rather than moved
+LEAP_RATIO = 3.0  # of a step over the usual one, beyond which the odometry leapt rather than moved
 LEAP_M, LEAP_RAD = 0.5, 0.3  # and at least this far
 METRIC_WALK = 0.1  # part of metric_scale_sigma that a metric odometry's scale may wander per sqrt(m)
 
@@ -44,12 +44,13 @@ def step_size(T_i_j: SE3) -> tuple[float, float]:
 def with_leap(edge: RelativePose, earlier: Sequence[tuple[float, float]], scale: float) -> RelativePose:
     """The edge, or, where its step is out of all proportion to the `earlier` ones, one that says next to nothing.
 
-    An odometry that lost its tracks leaps, by an amount that is no measurement: its sigmas are raised to that amount.
+    An odometry that lost its tracks leaps, by an amount that is no measurement: its sigmas are raised to that amount. What
+    is usual is the second largest step, so that one leap does not hide the next, and a robot that drives off does.
     """
-    if len(earlier) < 2:
+    if len(earlier) < 3:
         return edge
     length, angle = step_size(edge.T_i_j)
-    usual = np.max(earlier, axis=0)
+    usual = np.sort(earlier, axis=0)[-2]
     if length <= max(LEAP_RATIO * usual[0], LEAP_M / scale) and angle <= max(LEAP_RATIO * usual[1], LEAP_RAD):
         return edge
     return RelativePose(edge.i, edge.j, edge.T_i_j, np.maximum(edge.sigmas, np.r_[[angle] * 3, [length] * 3, 0.0]))
