@@ -8,8 +8,6 @@ information and "angle" GTSAM's, which takes the same numbers for Log(E). In SE2
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +16,7 @@ import numpy as np
 from xalign_ros.core.errors import FormatError
 from xalign_ros.core.lie import Array, quat_from_rotation, rotation_from_quat, sim3_exp, so3_exp, so3_log
 from xalign_ros.core.pose_graph import Chart, PoseGraph, SimilarityEdges
+from xalign_ros.io.text_files import read_text, write_text
 
 ROTATION_INFO = ("vec", "angle")
 INFORMATION = {"SE2": 6, "SE3:QUAT": 21, "SIM3:QUAT": 28, "SIM3:EXPMAP": 28}
@@ -46,12 +45,7 @@ class G2o:
 def read_g2o(path: str | Path, rotation_info: str = "vec") -> G2o:
     """Quaternions are normalised. Raises FormatError, with file and line, on what is no pose graph."""
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise FormatError(f"{path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"{path} is no text, so no g2o graph") from error
+    text = read_text(path, "no g2o graph")
     lines = _Lines()
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#", 1)[0].split()
@@ -246,15 +240,7 @@ def write_g2o(path: str | Path, g2o: G2o, R: Array, t: Array, s: Array) -> None:
     measured = np.hstack([_rows(edges.R, edges.t, edges.s, grammar), information[:, order[rows], order[columns]]])
     ends = zip(graph.keys[edges.i].tolist(), graph.keys[edges.j].tolist(), measured.tolist(), strict=True)
     lines += [f"EDGE_{tag} {i} {j} {_text(row)}\n" for i, j, row in ends]
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text("".join(lines), encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise FormatError(f"{path} cannot be written: {error.strerror}") from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
+    write_text(path, lines)
 
 
 def _rows(R: Array, t: Array, s: Array, grammar: str) -> Array:

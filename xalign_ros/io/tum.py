@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -13,6 +11,7 @@ import numpy as np
 from xalign_ros.core.errors import FormatError
 from xalign_ros.core.lie import Array, quat_from_rotation, rotation_from_quat, so3_exp, so3_log
 from xalign_ros.core.transforms import SE3, frozen
+from xalign_ros.io.text_files import read_text, write_text
 
 SAME_ROW_NS = 1_000_000
 MAX_GAP_NS = 100_000_000
@@ -50,12 +49,7 @@ def read_tum(path: str | Path) -> Trajectory:
     file and line, on rows that are not eight finite numbers, a quaternion far from unit norm, stamps that do not rise.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise FormatError(f"{path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"{path} is no text, so no TUM trajectory") from error
+    text = read_text(path, "no TUM trajectory")
     stamps: list[int] = []
     rows: list[list[float]] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -113,15 +107,7 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
         f"{_seconds(stamp)} {' '.join(f'{x:.9f}' for x in row)}\n"
         for stamp, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True)
     ]
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text("".join(lines), encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise FormatError(f"{path} cannot be written: {error.strerror}") from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
+    write_text(path, lines)
 
 
 def _seconds(stamp: int) -> str:
