@@ -1,5 +1,6 @@
 """Every residual's Jacobian against central differences, and the values that can be said by hand."""
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -10,7 +11,9 @@ from xalign_ros.core.graph_residuals import (
     so3_right_jacobian_inverse,
     whitened,
 )
+from xalign_ros.core.gtsam_bridge import to_gtsam
 from xalign_ros.core.pose_graph import Anchors, Chart, OdometryEdges, ScaleFreeEdges, ScaleSmoothness, SimilarityEdges
+from xalign_ros.core.transforms import Sim3
 
 COUNT = 40
 FIRST, SECOND = np.arange(COUNT), np.arange(COUNT) + COUNT
@@ -110,3 +113,27 @@ def test_whitened_lengths_are_chi_squares() -> None:
     r = rng.normal(size=(COUNT, 7))
     chi2 = np.einsum("mi,mij,mj->m", r, block.information, r)
     np.testing.assert_allclose((whitened(block, r) ** 2).sum(axis=1), chi2)
+
+
+def test_gtsam_gives_the_same_values() -> None:
+    """Of edges and priors on Sim(3); its Jacobians are approximate, so they are no reference."""
+    rng = np.random.default_rng(11)
+    R, t, sigma = nodes(rng)
+    edges = SimilarityEdges(FIRST, SECOND, R, t, np.exp(sigma), EYES)
+    priors = Anchors(FIRST, R, t, np.exp(sigma), EYES, Chart.LOG)
+    i, j = nodes(rng), nodes(rng)
+
+    def similarity(at, m):
+        return to_gtsam(Sim3(at[0][m], at[1][m], np.exp(at[2][m])))
+
+    unit = gtsam.noiseModel.Unit.Create(7)
+    r_edge, r_prior = linearize(edges, i, j)[0], linearize(priors, i, None)[0]
+    for m in range(COUNT):
+        Z, values = similarity((R, t, sigma), m), gtsam.Values()
+        values.insert(0, similarity(i, m))
+        values.insert(1, similarity(j, m))
+        for factor, r in (
+            (gtsam.BetweenFactorSimilarity3(0, 1, Z, unit), r_edge[m]),
+            (gtsam.PriorFactorSimilarity3(0, Z, unit), r_prior[m]),
+        ):
+            np.testing.assert_allclose(factor.unwhitenedError(values), r, atol=1e-9)
