@@ -233,7 +233,7 @@ def test_commands():
 
 
 # Import name -> name in package.xml and of the pip distribution, where they differ. None: rosdep has no key.
-ROSDEP = {name: None for name in ("gtsam", "poselib", "mcap", "zstandard", "rosbags")} | {
+ROSDEP = {name: None for name in ("gtsam", "poselib", "qdldl", "mcap", "zstandard", "rosbags")} | {
     "cv2": "python3-opencv",
     "matplotlib": "python3-matplotlib",
     "numpy": "python3-numpy",
