@@ -52,19 +52,22 @@ def warp_points(points: Array, offsets: np.ndarray, views: np.ndarray, D: Simila
     D34 = np.concatenate([D[2][:, None, None] * np.swapaxes(D[0], 1, 2), D[1][:, None]], axis=1).reshape(-1, 12)
     all_moved = bool(moved.all())
     out = np.empty_like(points)
+    ones = np.ones(int(np.diff(offsets[np.r_[: len(points) : CHUNK, len(points)]]).max(initial=0)))
     for start in range(0, len(points), CHUNK):
         part = slice(start, min(start + CHUNK, len(points)))
         first, last = offsets[part.start], offsets[part.stop]
-        rows, seers = offsets[part.start : part.stop + 1] - first, views[first:last]
-        weights = np.ones(last - first) if all_moved else moved[seers].astype(float)
-        shape = part.stop - part.start, len(moved)
-        seen_by = sparse.csr_matrix((weights, seers, rows.astype(np.int32)), shape)
+        rows, seers = (offsets[part.start : part.stop + 1] - first).astype(np.int32), views[first:last]
+        weights = ones[: last - first] if all_moved else moved[seers].astype(float)
+        seen_by = sparse.csr_matrix((weights, seers, rows), (part.stop - part.start, len(moved)))
         count = np.diff(rows) if all_moved else seen_by @ np.ones(len(moved))
         M = np.ascontiguousarray((seen_by @ D34).T)
         moved_to = M[9:]
         for k in range(3):
-            moved_to += M[3 * k : 3 * k + 3] * points[part, k]
-        out[part] = (moved_to / np.maximum(count, 1)).T
+            rotated = M[3 * k : 3 * k + 3]
+            rotated *= points[part, k]
+            moved_to += rotated
+        moved_to /= np.maximum(count, 1)
+        out[part] = moved_to.T
         if not count.all():
             out[part][count == 0] = points[part][count == 0]
     return out
