@@ -1,7 +1,7 @@
 """The pose-graph engine beside pyTheia and GTSAM; exit 1 on a miss. bench/graph.py [--only NAME] [--json].
 
 Names: golden, pytheia_50, pytheia_500, pytheia_5000, pytheia_50000, million, covariance, invariance, g2o, warp, window,
-online (half an hour on two cores, the others ten minutes together).
+online (an hour on two cores, the others ten minutes together).
 """
 
 from __future__ import annotations

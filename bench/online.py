@@ -1,6 +1,6 @@
 """The online policy beside single robust methods, and the sliding window's speed; cases of bench/graph.py.
 
-bench/online.py [SEEDS] prints the whole table alone (20 seeds take half an hour on two cores).
+bench/online.py [SEEDS] prints the whole table alone (20 seeds take an hour on two cores).
 """
 
 from __future__ import annotations
@@ -131,7 +131,9 @@ def online(case: Case, seeds: int = SEEDS) -> None:
             case.figure(f"{row}: part of seeds within 0.3 m by 15 right anchors", quick / seeds, low=0.9)
         if row in WITHOUT_SIGNAL:
             told = float(np.median([rms(run["ours, told"]) for run in runs]))
-            case.figure(f"{row}: ours with the session signal, m", told, high=2 * columns["Huber"])
+            case.figure(f"{row}: ours with the session signal, where it has a pose, m", told, high=2 * columns["Huber"])
+            with_pose = np.median([np.isfinite(run["ours, told"]).mean() for run in runs])
+            case.figure(f"{row}: part of keyframes with a pose then", with_pose)
         if row == "random 30 %":
             for name in ("ours", "blend 0.3", "blend 0.1"):
                 jumps = np.concatenate([run[f"jumps, {name}"] for run in runs])
