@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from xalign_ros.core.config import Odometry
 from xalign_ros.core.lie import Array
@@ -24,16 +25,21 @@ def edge_between(i: Keyframe, j: Keyframe, scale: float, config: Odometry) -> Re
     since an old error of heading swings the far end of the path without being noise of this edge.
     """
     T_i_j = i.T_odom_cam.inverse() @ j.T_odom_cam
-    distance = float(np.linalg.norm(T_i_j.t))
-    metres = scale * distance
-    rotation = config.rotation_floor_rad**2 + config.rotation_rad_per_sqrt_m**2 * metres
-    translation = (config.translation_floor_m / scale) ** 2 + (config.translation_ratio * distance) ** 2
     walk = METRIC_WALK * config.metric_scale_sigma if j.metric_scale else config.scale_per_sqrt_m
-    variance = np.r_[np.full(3, rotation), np.full(3, translation), walk**2 * max(metres, 1e-4)]
+    variance = edge_variance(np.linalg.norm(T_i_j.t), scale, walk, config)
     if i.cov_cam is not None and j.cov_cam is not None:
         Ad = T_i_j.inverse().as_sim3().adjoint()[:6, :6]
         variance[:6] = np.fmax(variance[:6], np.diag(j.cov_cam - Ad @ i.cov_cam @ Ad.T))  # NaN is unknown
     return RelativePose(i.id, j.id, T_i_j, np.sqrt(variance))
+
+
+def edge_variance(distance: ArrayLike, scale: float, walk: float, config: Odometry) -> Array:
+    """The model's variances (..., 7) of edges over distances (...) in odometry units; `walk` of log-scale per sqrt(m)."""
+    d = np.asarray(distance, float)
+    metres = scale * d
+    rotation = config.rotation_floor_rad**2 + config.rotation_rad_per_sqrt_m**2 * metres
+    translation = (config.translation_floor_m / scale) ** 2 + (config.translation_ratio * d) ** 2
+    return np.stack([*[rotation] * 3, *[translation] * 3, walk**2 * np.maximum(metres, 1e-4)], axis=-1)
 
 
 def step_size(T_i_j: SE3) -> tuple[float, float]:
