@@ -1,5 +1,7 @@
 """pyTheia's API: golden vectors, the page's example as it stands, what is dead or wrong there, and what is refused."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from graph_problems import GOLDEN
@@ -78,7 +80,7 @@ def test_conventions() -> None:
 def test_golden_graphs(name) -> None:
     z = np.load(GOLDEN / f"pytheia_golden_pgo_{name}.npz")
     options = pt.sfm.CrossReconstructionPoseGraphOptions()
-    for field in vars(options):
+    for field in asdict(options):
         if f"opt_{field}" in z:
             setattr(options, field, z[f"opt_{field}"].item())
     options.max_num_iterations = 0
@@ -139,7 +141,7 @@ def test_the_pages_example_runs_verbatim() -> None:
 
 def test_structs_have_pytheias_defaults() -> None:
     constraint = pt.sfm.RelativePoseConstraint()
-    assert vars(constraint) == {
+    assert asdict(constraint) == {
         "view_id_i": 4294967295,
         "view_id_j": 4294967295,
         "translation_sqrt_weight": 1.0,
@@ -149,7 +151,7 @@ def test_structs_have_pytheias_defaults() -> None:
         "translation_magnitude_sqrt_weight": 0.0,
     }
     options = pt.sfm.CrossReconstructionPoseGraphOptions()
-    assert vars(options) == {
+    assert asdict(options) == {
         "sequential_weight": 1.0,
         "anchor_weight": 1.0,
         "sequential_translation_magnitude_weight": 0.2,
@@ -204,6 +206,7 @@ def test_fixed_views_are_constants_that_edges_may_use() -> None:
     run, segment = reconstruction(2), pt.sfm.Reconstruction()
     for n in range(4):
         view = segment.View(segment.AddView(f"s{n}", n))
+        view.SetIsEstimated(True)
         view.Camera().SetPosition([0, 0, 10.0 * n])
     optimizer = pt.sfm.CrossReconstructionSim3PoseGraphOptimizer()
     optimizer.set_fixed_reconstruction(segment, [3])
@@ -239,11 +242,74 @@ def broken(change):
         (lambda c: setattr(c.sequential_edges[0], "measured_S_ji_log", np.zeros(6)), "has 7 numbers, not 6"),
         (lambda c: setattr(c.cross_view_edges[0], "measured_S_run_in_seg_log", [0] * 6 + [25]), "log-scale"),
         (lambda c: setattr(c.cross_view_edges[0], "weight", np.nan), "not finite"),
+        (lambda c: [setattr(e, "weight", 0.0) for e in c.cross_view_edges], "no cross-view edge with a weight"),
+        (lambda c: setattr(c.sequential_edges[2], "sqrt_information", np.eye(6)), r"edge 2 has shape \(6, 6\)"),
     ],
 )
 def test_misuse_is_a_sentence_and_no_abort(change, words) -> None:
     with pytest.raises(ValueError, match=words):
         broken(change)
+
+
+@pytest.mark.parametrize("name", list(asdict(pt.sfm.CrossReconstructionPoseGraphOptions())))
+def test_an_option_that_is_no_number_is_named(name) -> None:
+    run = reconstruction()
+    options = pt.sfm.CrossReconstructionPoseGraphOptions(**{name: np.nan})
+    with pytest.raises(ValueError, match=f"the option {name} is nan"):
+        pt.sfm.AlignReconstructionsWithPoseGraph(run, run, constraints(run, run), options)
+
+
+@pytest.mark.parametrize(
+    "struct",
+    [
+        pt.sfm.CrossReconstructionPoseGraphOptions,
+        pt.sfm.CrossReconstructionConstraints,
+        pt.sfm.SequentialSim3Edge,
+        pt.sfm.CrossViewAnchorEdge,
+        pt.sfm.RelativePoseConstraint,
+    ],
+)
+def test_a_field_that_is_not_there_is_no_field(struct) -> None:
+    with pytest.raises(AttributeError):
+        struct().anchor_wieght = 2.0
+
+
+def test_views_without_a_pose_are_neither_found_nor_fixed() -> None:
+    run = reconstruction()
+    c = constraints(run, run)
+    run.View(3).SetIsEstimated(False)
+    with pytest.raises(ValueError, match="variable view 3 is not estimated and was given no initial pose"):
+        pt.sfm.AlignReconstructionsWithPoseGraph(run, run, c)
+    optimizer = pt.sfm.CrossReconstructionSim3PoseGraphOptimizer()
+    with pytest.raises(ValueError, match="fixed view 3 is not estimated"):
+        optimizer.set_fixed_reconstruction(run, [3])
+    optimizer.set_variable_reconstruction(run, run.ViewIds())
+    optimizer.set_constraints(c)
+    optimizer.set_initial_variable_poses({3: pt.sfm.GetSim3LieFromView(run.View(3))})
+    assert optimizer.optimize()[0]
+
+
+def test_a_start_beyond_the_bounds_of_log_scale_is_refused_and_one_at_them_is_not() -> None:
+    run = reconstruction()
+    optimizer = pt.sfm.CrossReconstructionSim3PoseGraphOptimizer()
+    optimizer.set_variable_reconstruction(run, [0])
+    optimizer.set_initial_variable_poses({0: np.r_[np.zeros(6), -20.0]})
+    with pytest.raises(ValueError, match=r"view 0 has log-scale 20\.1"):
+        optimizer.set_initial_variable_poses({0: np.r_[np.zeros(6), 20.1]})
+
+
+def test_a_track_at_infinity_stops_the_writing_back_before_it_begins() -> None:
+    run = reconstruction()
+    run.Track(2).SetPoint([1, 2, 3, 0])
+    optimizer = pt.sfm.CrossReconstructionSim3PoseGraphOptimizer()
+    optimizer.set_variable_reconstruction(run, run.ViewIds())
+    optimizer.set_initial_variable_poses({0: np.r_[9.0, np.zeros(6)]})
+    before = run.View(0).Camera().GetPosition()
+    with pytest.raises(ValueError, match="fourth coordinate 0"):
+        optimizer.apply_to_variable_reconstruction(run)
+    np.testing.assert_array_equal(run.View(0).Camera().GetPosition(), before)
+    optimizer.apply_to_variable_reconstruction(run, transform_tracks=False)
+    np.testing.assert_allclose(run.View(0).Camera().GetPosition(), [-9, 0, 0])
 
 
 def test_the_reconstruction_answers_as_pytheias() -> None:
@@ -253,6 +319,11 @@ def test_the_reconstruction_answers_as_pytheias() -> None:
     assert recon.ViewIdFromName("1") == 1 and recon.ViewIdFromName("x") == 4294967295
     assert (recon.NumViews(), recon.NumTracks(), recon.TrackIds()) == (2, 1, [0])
     assert recon.View(1).GetTimestamp() == 1.0 and recon.Track(0).NumViews() == 2
+    assert recon.AddView("grouped", 0, 7.0) == 2 and recon.View(2).GetTimestamp() == 7.0
+    feature = pt.sfm.Feature(np.array([1.0, 2.0]))
+    assert recon.AddObservation(2, 0, feature) and not recon.AddObservation(2, 0, feature)
+    np.testing.assert_array_equal(pt.sfm.Feature(1.0, 2.0).point, feature.point)
+    np.testing.assert_array_equal(pt.sfm.Track().Point(), np.zeros(4))
     camera = recon.View(0).Camera()
     camera.SetOrientationFromAngleAxis([0.1, 0.2, 0.3])
     np.testing.assert_allclose(camera.GetOrientationAsAngleAxis(), [0.1, 0.2, 0.3])

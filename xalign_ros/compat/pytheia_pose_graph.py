@@ -25,6 +25,7 @@ from xalign_ros.compat.pytheia_structs import (
 from xalign_ros.core.graph import Solution, solve
 from xalign_ros.core.lie import Array
 from xalign_ros.core.pose_graph import (
+    MAX_LOG_SCALE,
     Anchors,
     Chart,
     Loss,
@@ -52,6 +53,7 @@ class CrossReconstructionSim3PoseGraphOptimizer:
     def __init__(self, options: CrossReconstructionPoseGraphOptions | None = None) -> None:
         self.options = options or CrossReconstructionPoseGraphOptions()
         self._fixed: dict[int, Array] = {}
+        self._poseless: set[int] = set()
         self._variable: dict[int, Array] = {}
         self._sequential: list[SequentialSim3Edge] = []
         self._anchors: list[CrossViewAnchorEdge] = []
@@ -60,19 +62,30 @@ class CrossReconstructionSim3PoseGraphOptimizer:
     def set_fixed_reconstruction(self, reconstruction: Reconstruction, view_ids: Iterable[int]) -> None:
         """Constant poses that edges may use; a variable view of the same id goes before it."""
         views = views_of(reconstruction, list(view_ids), "fixed")
+        for k, v in views.items():
+            if not v.IsEstimated():
+                raise ValueError(f"fixed view {k} is not estimated, so it has no pose")
         self._fixed = {k: GetSim3LieFromView(v) for k, v in views.items()}
 
     def set_variable_reconstruction(self, reconstruction: Reconstruction, view_ids: Iterable[int]) -> None:
         """The poses to find, in the order along which scale is smooth."""
         views = views_of(reconstruction, list(view_ids), "variable")
         self._variable = {k: GetSim3LieFromView(v) for k, v in views.items()}
+        self._poseless = {k for k, v in views.items() if not v.IsEstimated()}
 
     def set_initial_variable_poses(self, poses: Mapping[int, Array]) -> None:
-        """Start values (7,) of variable views; ids that are none are passed over."""
+        """Start values (7,) of variable views; ids that are none are passed over.
+
+        Raises ValueError on numbers that are not finite and on a log-scale beyond +-20.
+        """
         for view_id, lie in poses.items():
             if view_id in self._variable:
                 similarity(lie, f"the initial pose of view {view_id}")
-                self._variable[view_id] = np.array(lie, float)
+                start = np.array(lie, float).reshape(7)
+                if abs(start[6]) > MAX_LOG_SCALE + 1e-9:  # what optimize() left at the bound may come back
+                    raise ValueError(f"the initial pose of view {view_id} has log-scale {start[6]:g}, beyond +-20")
+                self._variable[view_id] = start
+                self._poseless.discard(view_id)
 
     def add_sequential_edge(self, edge: SequentialSim3Edge) -> None:
         self._sequential.append(edge)
@@ -95,8 +108,9 @@ class CrossReconstructionSim3PoseGraphOptimizer:
     def optimize(self) -> tuple[bool, CrossReconstructionPoseGraphSummary]:
         """Solve; success says that it converged or came to the iteration limit with a lower cost.
 
-        Raises ValueError on views that are not there, an edge from a view to itself, numbers that are not finite, a
-        weight that is not positive, and where nothing ties the variable views to the fixed frame.
+        Raises ValueError on edges to views that are not there or from a view to itself, numbers that are not finite, a
+        variable view that neither is estimated nor was given an initial pose, and where nothing ties the variable views
+        to the fixed frame.
         """
         solution = solve(self._graph(), max_iterations=self.options.max_num_iterations)
         count = len(self._variable)
@@ -114,7 +128,17 @@ class CrossReconstructionSim3PoseGraphOptimizer:
         """Write the poses back into estimated views, and move tracks along with the views that see them.
 
         A track moves world to world, by the mean over its moved views of T_new^-1 T_old, both rigid and world to camera.
+        Raises ValueError, with nothing moved yet, on an estimated track whose point is at infinity.
         """
+        tracks = [
+            x
+            for k in (reconstruction.TrackIds() if transform_tracks else [])
+            if (x := reconstruction.Track(k)) is not None and x.IsEstimated()
+        ]
+        homogeneous = np.array([track.Point() for track in tracks]).reshape(-1, 4)
+        if not homogeneous[:, 3].all():
+            raise ValueError("an estimated track has the fourth coordinate 0, so there is no point to move")
+        points = homogeneous[:, :3] / homogeneous[:, 3:]
         inverse_R, inverse_t = [], []
         rows: dict[int, int] = {}
         for view_id, lie in self._variable.items():
@@ -127,13 +151,9 @@ class CrossReconstructionSim3PoseGraphOptimizer:
             rows[view_id] = len(rows)
             inverse_R.append(D.R)
             inverse_t.append(D.t)
-        if not transform_tracks or not rows:
+        if not rows:
             return
-        tracks = [
-            x for k in reconstruction.TrackIds() if (x := reconstruction.Track(k)) is not None and x.IsEstimated()
-        ]
         seen = [[rows[v] for v in sorted(track.ViewIds()) if v in rows] for track in tracks]
-        points = np.array([track.Point()[:3] / track.Point()[3] for track in tracks]).reshape(-1, 3)
         offsets = np.cumsum([0, *map(len, seen)])
         D_all = np.array(inverse_R), np.array(inverse_t), np.ones(len(rows))
         views = np.array([row for rows_ in seen for row in rows_], np.int32)
@@ -145,6 +165,9 @@ class CrossReconstructionSim3PoseGraphOptimizer:
         o, variable = self.options, list(self._variable)
         if not variable:
             raise ValueError("there are no variable views; set_variable_reconstruction names them")
+        if self._poseless:
+            raise ValueError(f"variable view {min(self._poseless)} is not estimated and was given no initial pose")
+        o.check()
         fixed = [k for k in self._fixed if k not in self._variable]
         row = {k: n for n, k in enumerate([*variable, *fixed])}
         S = stack(
@@ -154,8 +177,11 @@ class CrossReconstructionSim3PoseGraphOptimizer:
             ]
         )
         ends = [_ends(row, "sequential edge", n, e.view_id_i, e.view_id_j) for n, e in enumerate(self._sequential)]
-        if not self._anchors and not any(max(pair) >= len(variable) for pair in ends):
-            raise ValueError("there is no cross-view edge, so nothing ties the variable views to the fixed frame")
+        weights = o.anchor_weight * np.array([e.weight for e in self._anchors], float)
+        if not weights.any() and not any(max(pair) >= len(variable) for pair in ends):
+            raise ValueError(
+                "there is no cross-view edge with a weight, so nothing ties the variable views to the fixed frame"
+            )
         at = [_row(row, "cross-view edge", n, e.variable_view_id) for n, e in enumerate(self._anchors)]
         measured = stack(
             [
@@ -169,7 +195,10 @@ class CrossReconstructionSim3PoseGraphOptimizer:
                 for n, e in enumerate(self._anchors)
             ]
         )
-        weights = o.anchor_weight * np.array([e.weight for e in self._anchors], float)
+        roots = [
+            _matrix(e.sqrt_information, f"the sqrt_information of sequential edge {n}")
+            for n, e in enumerate(self._sequential)
+        ]
         smooth = (
             [(n, n + 1, o.scale_smooth_weight) for n in range(len(variable) - 1)] if o.auto_scale_smoothness else []
         )
@@ -186,7 +215,7 @@ class CrossReconstructionSim3PoseGraphOptimizer:
                 pairs[:, 0],
                 pairs[:, 1],
                 *measured[:2],
-                o.sequential_weight * np.array([e.sqrt_information for e in self._sequential], float).reshape(-1, 7, 7),
+                o.sequential_weight * np.array(roots).reshape(-1, 7, 7),
                 o.sequential_translation_magnitude_weight,
             ),
             anchors=Anchors(
@@ -236,6 +265,13 @@ def AlignReconstructionsWithPoseGraph(
 def _rigid(view: View) -> SE3:
     R = view.Camera().GetOrientationAsRotationMatrix()
     return SE3(R, -R @ view.Camera().GetPosition())
+
+
+def _matrix(value: Array, what: str) -> Array:
+    A = np.asarray(value, float)
+    if A.shape != (7, 7):
+        raise ValueError(f"{what} has shape {A.shape}, needed is (7, 7)")
+    return A
 
 
 def _row(row: Mapping[int, int], kind: str, n: int, view_id: int) -> int:

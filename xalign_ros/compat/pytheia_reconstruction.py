@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +13,7 @@ from xalign_ros.core.transforms import Sim3
 
 __all__ = [
     "Camera",
+    "Feature",
     "GetSim3LieFromView",
     "Reconstruction",
     "RelativeSim3BetweenViews",
@@ -79,12 +81,19 @@ class View:
     MutableCamera = Camera
 
 
+class Feature:
+    """Where a view sees a track: point (2,) px."""
+
+    def __init__(self, *point: Any) -> None:  # (2,), or x and y
+        self.point = _vector(point[0] if len(point) == 1 else point, 2, "a feature") if point else np.zeros(2)
+
+
 class Track:
     def __init__(self) -> None:
-        self._point, self._estimated, self._views = np.array([0.0, 0, 0, 1]), False, set[int]()
+        self._point, self._estimated, self._views = np.zeros(4), False, set[int]()
 
     def Point(self) -> Array:
-        """Homogeneous (4,)."""
+        """Homogeneous (4,); zeros until it is set."""
         return self._point.copy()
 
     def SetPoint(self, point: ArrayLike) -> None:
@@ -113,8 +122,14 @@ class Reconstruction:
         self._views: dict[int, View] = {}
         self._tracks: dict[int, Track] = {}
 
-    def AddView(self, name: str, timestamp: float) -> int:
-        """The new view's id, or kInvalidViewId where the name or the timestamp is taken."""
+    def AddView(self, name: str, *group_and_timestamp: float) -> int:
+        """AddView(name, timestamp) or (name, intrinsics group, timestamp): the new view's id.
+
+        kInvalidViewId where the name or the timestamp is taken. The group is not of a pose graph and is not kept.
+        """
+        if len(group_and_timestamp) not in (1, 2):
+            raise TypeError("AddView takes a name, perhaps an intrinsics group, and a timestamp")
+        timestamp = float(group_and_timestamp[-1])
         if any(name == v.Name() or timestamp == v.GetTimestamp() for v in self._views.values()):
             return kInvalidViewId
         self._views[len(self._views)] = View(name, timestamp)
@@ -138,9 +153,9 @@ class Reconstruction:
         self._tracks[len(self._tracks)] = Track()
         return len(self._tracks) - 1
 
-    def AddObservation(self, view_id: int, track_id: int, feature: object = None) -> bool:
-        """False for an unknown view or track; the feature itself is not of a pose graph and is not kept."""
-        if view_id not in self._views or track_id not in self._tracks:
+    def AddObservation(self, view_id: int, track_id: int, feature: Feature | None = None) -> bool:
+        """False for an unknown view or track and where the view has the track; the feature is not kept."""
+        if view_id not in self._views or track_id not in self._tracks or view_id in self._tracks[track_id].ViewIds():
             return False
         self._tracks[track_id].AddView(view_id)
         return True

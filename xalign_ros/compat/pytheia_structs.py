@@ -1,4 +1,7 @@
-"""pyTheia's constraint, option and summary structs: mutable, with its fields and defaults."""
+"""pyTheia's constraint, option and summary structs: mutable, with its fields and defaults.
+
+They have slots, so a field that is not there is an AttributeError, as in pyTheia, and no setting is lost to a typo.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ __all__ = [
 ]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class RelativePoseConstraint:
     """An odometry edge of bundle adjustment."""
 
@@ -32,7 +35,7 @@ class RelativePoseConstraint:
     translation_magnitude_sqrt_weight: float = 0.0
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class SequentialSim3Edge:
     """measured_S_ji_log (7,): Log(S_i^-1 S_j) in Sophus' order; sqrt_information (7, 7): rotation, direction, magnitude."""
 
@@ -42,7 +45,7 @@ class SequentialSim3Edge:
     sqrt_information: Array = field(default_factory=lambda: np.eye(7))
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class CrossViewAnchorEdge:
     """measured_S_run_in_seg_log (7,): what S of the view should be, in Sophus' order; one weight for all of it."""
 
@@ -51,7 +54,7 @@ class CrossViewAnchorEdge:
     weight: float = 1.0
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class CrossReconstructionConstraints:
     variable_keyframe_view_ids: list[int] = field(default_factory=list)
     fixed_anchor_view_ids: list[int] = field(default_factory=list)
@@ -59,7 +62,7 @@ class CrossReconstructionConstraints:
     cross_view_edges: list[CrossViewAnchorEdge] = field(default_factory=list)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class CrossReconstructionPoseGraphOptions:
     sequential_weight: float = 1.0
     anchor_weight: float = 1.0
@@ -71,8 +74,16 @@ class CrossReconstructionPoseGraphOptions:
     verbose: bool = False
     debug_cost_breakdown: bool = False
 
+    def check(self) -> None:
+        """Raises ValueError on a number that is not finite and on fewer than 0 iterations."""
+        for name in self.__slots__:
+            if not np.isfinite(getattr(self, name)):
+                raise ValueError(f"the option {name} is {getattr(self, name)}")
+        if self.max_num_iterations < 0:
+            raise ValueError(f"the option max_num_iterations is {self.max_num_iterations}; it cannot be negative")
 
-@dataclass(eq=False)
+
+@dataclass(eq=False, slots=True)
 class CrossReconstructionPoseGraphSummary:
     """The residual costs are sums of squares of the residuals as the loss leaves them, without the half."""
 
