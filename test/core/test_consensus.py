@@ -58,7 +58,7 @@ def test_any_scale_is_found(scale):
 
 
 def test_noisy_witnesses_nearly_always_agree():
-    """Three at the least, as many as the gate of 99.9 % promises."""
+    """Three at the least, nearly all that are right."""
     counts = []
     for seed in range(40):
         found = find_consensus(witnesses_of(POSES[:5], rng=np.random.default_rng(seed)), False, CONFIG)

@@ -68,7 +68,7 @@ class Lock:
 
     anchors: int = option(3, "1", "anchors that must agree under one similarity", 2, 100)
     scale_sigma: float = option(0.15, "1", "log-scale sigma above which a lock waits for more motion", 0.001, 10.0)
-    chi2: float = option(22.46, "1", "gate on 6 degrees of freedom, 99.9 %", 1.0, 1000.0)
+    chi2: float = option(33.11, "1", "gate on 6 degrees of freedom; of right anchors one in 100,000 fails", 1.0, 1000.0)
     memory: int = option(100, "1", "keyframes that a waiting anchor is remembered", 2, 1000)
     cap: int = option(
         10,
