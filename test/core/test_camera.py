@@ -14,9 +14,15 @@ CAMERAS = {
     "radtan8": Camera("radtan", K, [0.9, 0.4, 1e-4, 2e-4, 0.05, 1.2, 0.5, 0.1], 640, 480),
     "equidistant": Camera("equidistant", K, [-0.01, 0.02, -0.008, 0.001], 640, 480),
     "fov": Camera("fov", K, [0.9], 640, 480),
+    "division": Camera("division", K, [-0.12], 640, 480),
+    "division the other way": Camera("division", K, [0.08], 640, 480),
+    "eucm": Camera("eucm", K, [0.62, 1.08], 640, 480),
+    "eucm below a half": Camera("eucm", K, [0.3, 0.9], 640, 480),
+    "double_sphere": Camera("double_sphere", K, [-0.18, 0.59], 640, 480),
+    "double_sphere below a half": Camera("double_sphere", K, [0.1, 0.4], 640, 480),
 }
 every = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-FISHEYES = ("equidistant", "fov")
+FISHEYES = {"equidistant": [0, 0, 0, 0], "fov": [0.9], "eucm": [0.62, 1.08], "double_sphere": [-0.18, 0.59]}
 
 
 def on_image(camera, n=400, seed=0):
@@ -25,7 +31,7 @@ def on_image(camera, n=400, seed=0):
     x = np.column_stack([rng.uniform(-1.2, 1.2, (n, 2)), np.ones(n)]) * rng.uniform(0.3, 30, (n, 1))
     uv, valid = camera.project(x)
     seen = valid & camera.inside(uv)
-    assert seen.sum() > n // 4
+    assert seen.sum() > n // 5
     return x[seen], uv[seen]
 
 
@@ -117,6 +123,39 @@ def test_pixel_zero_is_the_centre_of_the_first_pixel():
     assert camera.inside(uv, 1.0).tolist() == [True, True, True, True, False]
 
 
+def test_double_sphere_against_its_formula():
+    """Usenko et al., equations 40 to 43."""
+    camera = CAMERAS["double_sphere"]
+    x, uv = on_image(camera)
+    xi, alpha = camera.D
+    d1 = np.linalg.norm(x, axis=1)
+    d2 = np.sqrt(x[:, 0] ** 2 + x[:, 1] ** 2 + (xi * d1 + x[:, 2]) ** 2)
+    w = alpha * d2 + (1 - alpha) * (xi * d1 + x[:, 2])
+    np.testing.assert_allclose(uv, K[:2] * x[:, :2] / w[:, None] + K[2:], atol=1e-9)
+
+
+def test_eucm_and_double_sphere_meet_in_the_unified_model():
+    """With beta = 1 and xi = 0 both are the unified model; with alpha = 0 a pinhole."""
+    for alpha in (0.0, 0.4, 0.7):
+        eucm, ds = Camera("eucm", K, [alpha, 1.0], 640, 480), Camera("double_sphere", K, [0.0, alpha], 640, 480)
+        x, uv = on_image(eucm)
+        np.testing.assert_allclose(ds.project(x)[0], uv, atol=1e-9)
+        np.testing.assert_allclose(ds.unproject(uv)[0], eucm.unproject(uv)[0], atol=1e-12)
+        if alpha == 0:
+            np.testing.assert_allclose(CAMERAS["pinhole"].project(x)[0], uv, atol=1e-9)
+
+
+def test_where_a_spherical_model_ends():
+    """Above alpha = 1/2 rays beyond z = -(1 - alpha) / alpha d fold back (Khomutenko et al., equation 12)."""
+    camera = Camera("eucm", K, [0.7, 1.0], 640, 480)
+    end = np.arccos(-0.3 / 0.7)
+    assert camera.limit == pytest.approx(end, abs=2e-3)
+    angle = np.array([end - 0.01, end + 0.01])
+    assert camera.project(np.column_stack([np.sin(angle), [0, 0], np.cos(angle)]))[1].tolist() == [True, False]
+    far = K[2] + K[0] / np.sqrt(0.4) + np.array([-1.0, 1.0])  # radius at which the root vanishes
+    assert camera.unproject(np.column_stack([far, [K[3], K[3]]]))[1].tolist() == [True, False]
+
+
 # Where a model ends -------------------------------------------------------------------------------------------------
 
 
@@ -131,8 +170,8 @@ def test_behind_the_camera_is_invalid_and_nan(name):
 
 @pytest.mark.parametrize("name", FISHEYES)
 def test_a_fisheye_sees_sideways_and_a_little_back(name):
-    camera = Camera(CAMERAS[name].model, [100, 100, 500, 500], [0.9] if name == "fov" else [0, 0, 0, 0], 1000, 1000)
-    angle = np.deg2rad([60, 89, 91, 120])
+    camera = Camera(name, [100, 100, 500, 500], FISHEYES[name], 1000, 1000)
+    angle = np.deg2rad([60, 89, 91, 110])
     x = np.column_stack([np.sin(angle), np.zeros(4), np.cos(angle)])
     uv, valid, J = camera.project_with_jacobian(x)
     assert valid.all() and (np.diff(uv[:, 0]) > 0).all() and np.isfinite(J).all()
@@ -196,7 +235,10 @@ def test_pixels_that_are_no_numbers_are_invalid():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"model": "brown"}, "camera model 'brown' is not one of radtan, equidistant, fov"),
+        (
+            {"model": "brown"},
+            "camera model 'brown' is not one of radtan, equidistant, fov, eucm, double_sphere, division",
+        ),
         ({"D": [0.1, 0.2, 0.3]}, "radtan takes"),
         ({"model": "equidistant", "D": [0.1]}, "equidistant takes"),
         ({"model": "fov", "D": [0.1, 0.2]}, "fov takes"),
@@ -211,6 +253,10 @@ def test_pixels_that_are_no_numbers_are_invalid():
         ({"model": "fov", "D": [0.0]}, "fov"),
         ({"model": "fov", "D": [-0.9]}, "fov"),
         ({"model": "fov", "D": [4.0]}, "fov"),
+        ({"model": "eucm", "D": [1.1, 1.0]}, "alpha in 0..1"),
+        ({"model": "eucm", "D": [0.5, 0.0]}, "beta above 0"),
+        ({"model": "double_sphere", "D": [-1.0, 0.5]}, "xi in -1..1"),
+        ({"model": "double_sphere", "D": [0.1, -0.1]}, "alpha in 0..1"),
     ],
 )
 def test_what_cannot_be_a_camera_is_an_error(change, words):

@@ -45,9 +45,14 @@ LENSES = {
     "RADIAL_FISHEYE": "equidistant",
     "OPENCV_FISHEYE": "equidistant",
     "FOV": "fov",
+    "SIMPLE_DIVISION": "division",
+    "DIVISION": "division",
+    "EUCM": "eucm",
 }
 VALUES = dict(f=400.0, fx=410.0, fy=395.0, cx=318.25, cy=243.5, omega=0.9, k=-0.07, p1=0.004, p2=-0.003)
-VALUES |= dict(k1=-0.09, k2=0.031, k3=-0.007, k4=0.012, k5=-0.021, k6=0.005)  # each different: order shows
+VALUES |= dict(
+    k1=-0.09, k2=0.031, k3=-0.007, k4=0.012, k5=-0.021, k6=0.005, alpha=0.62, beta=1.08
+)  # each different: order shows
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +123,7 @@ def test_other_models_are_refused_by_name(model: str, world: World, folder: Path
     ("camera", "words"),
     [
         (lens("FOV", omega=3.5), "field of view of 3.5 rad"),
+        (lens("EUCM", alpha=1.5), "alpha in 0..1"),
         (lens("PINHOLE", fy=-1.0), "no usable intrinsics"),
     ],
 )
@@ -132,7 +138,7 @@ def test_impossible_camera_is_refused(
 
 
 def test_camera_that_no_image_uses_may_be_any(world: World, folder: Path, tmp_path: Path) -> None:
-    spare = ColmapCamera(9, "EUCM", 640, 480, np.ones(6))
+    spare = ColmapCamera(9, "THIN_PRISM_FISHEYE", 640, 480, np.ones(12))
     write_model(replace(world.model, cameras=world.model.cameras | {9: spare}), tmp_path / "m", True)
     assert len(read_colmap_reconstruction(tmp_path / "m", folder / "database.db").cameras) == 2
 

@@ -88,6 +88,9 @@ CAMERAS = [
     ("radtan", [0.1, -0.02, 1e-3, 1e-3, 0.01, 0.2, 0.01, 0.001], "rational_polynomial"),
     ("equidistant", [0.01, 0.002, 0.0, 0.0], "equidistant"),
     ("fov", [0.92], "fov"),
+    ("eucm", [0.62, 1.08], "eucm"),
+    ("double_sphere", [-0.18, 0.59], "double_sphere"),
+    ("division", [-0.12], "division"),
 ]
 
 

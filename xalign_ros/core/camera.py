@@ -3,7 +3,10 @@
 Every model maps a point of the camera frame (x right, y down, z forward) to a distorted normalised point m and then to
 pixels u = f m + c. `radtan` is OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 (ROS plumb_bob and rational_polynomial), `equidistant`
 is Kannala-Brandt with theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8), `fov` is Devernay-Faugeras with
-r_d = atan(2 r tan(w/2)) / w.
+r_d = atan(2 r tan(w/2)) / w. `eucm` (alpha, beta) is the enhanced unified model (Khomutenko et al., "An enhanced unified
+camera model", 2016), `double_sphere` (xi, alpha) that of Usenko et al. ("The double sphere camera model", 2018),
+`division` (k) Fitzgibbon's, r = r_d / (1 + k r_d^2) ("Simultaneous linear estimation of multiple view geometry and lens
+distortion", 2001).
 """
 
 from __future__ import annotations
@@ -16,7 +19,14 @@ from numpy.typing import ArrayLike
 from xalign_ros.core.lie import Array
 from xalign_ros.core.transforms import frozen
 
-MODELS = {"radtan": (0, 4, 5, 8), "equidistant": (4,), "fov": (1,)}
+MODELS = {
+    "radtan": (0, 4, 5, 8),
+    "equidistant": (4,),
+    "fov": (1,),
+    "eucm": (2,),
+    "double_sphere": (2,),
+    "division": (1,),
+}
 NO_JACOBIAN = np.zeros((0, 2, 3))
 MAX_ANGLE_RAD = np.deg2rad(170.0)  # of a fisheye ray from the axis; nothing real sees further
 
@@ -46,6 +56,10 @@ class Camera:
             raise ValueError(f"camera has no usable intrinsics: K = {self.K.tolist()}, D = {self.D.tolist()}")
         if self.model == "fov" and not 0 < self.D[0] < np.pi:
             raise ValueError(f"fov's coefficient is {self.D[0]:g} rad, needed is an angle between 0 and pi")
+        if self.model == "eucm" and not (0 <= self.D[0] <= 1 and self.D[1] > 0):
+            raise ValueError(f"eucm takes alpha in 0..1 and beta above 0, not {self.D.tolist()}")
+        if self.model == "double_sphere" and not (-1 < self.D[0] <= 1 and 0 <= self.D[1] <= 1):
+            raise ValueError(f"double_sphere takes xi in -1..1 and alpha in 0..1, not {self.D.tolist()}")
         if self.width <= 0 or self.height <= 0:
             raise ValueError(f"camera image is {self.width} x {self.height} px")
         object.__setattr__(self, "limit", self._monotonic_limit())
@@ -53,9 +67,11 @@ class Camera:
     def _monotonic_limit(self) -> float:
         if self.model == "fov":
             return float(MAX_ANGLE_RAD)
-        if self.model == "equidistant":
+        if self.model != "radtan":
             x = np.linspace(0, MAX_ANGLE_RAD, 2000)
-            y = x * np.polyval([*self.D[::-1], 1.0], x * x)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                y = _RADIAL[self.model](self.D, np.sin(x), np.cos(x))[0]
+            y[~np.isfinite(y)] = -1.0  # beyond the last radius: falling
         else:
             x = np.geomspace(1e-3, 50.0, 4000)
             y = x * _radial(_eight(self.D), x * x)[0]
@@ -128,7 +144,12 @@ class Camera:
         return a, np.asarray(valid)
 
     def _angle(self, r_d: Array) -> tuple[Array, np.ndarray]:
-        """Angle from the optical axis (N,) rad of distorted radii (N,), for the fisheye models."""
+        """Angle from the optical axis (N,) rad of distorted radii (N,), for the models along the radius."""
+        if self.model in _RAY:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                r, z = _RAY[self.model](self.D, r_d)
+                angle = np.arctan2(r, z)
+                return angle, np.isfinite(angle) & (angle <= self.limit)
         if self.model == "fov":
             w = self.D[0]
             angle = np.arctan2(np.sin(r_d * w), 2 * np.tan(w / 2) * np.cos(r_d * w))
@@ -190,21 +211,11 @@ def _distort_radtan(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np
 
 
 def _distort_radial(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:
-    """Equidistant and FOV: m = (x, y) q / r with q a function of the angle between ray and axis."""
+    """All models but radtan: m = (x, y) q / r with q a function of the angle between ray and axis."""
     r, z = np.hypot(x[:, 0], x[:, 1]), x[:, 2]
     angle = np.arctan2(r, z)
     n2 = r * r + z * z
-    if camera.model == "fov":
-        w = camera.D[0]
-        c = 2 * np.tan(w / 2)
-        q = np.arctan2(c * r, z) / w
-        g = c / w / (c * c * r * r + z * z)
-        dq_dr, dq_dz = g * z, -g * r
-    else:
-        poly = np.array([*camera.D[::-1], 1.0])
-        q = angle * np.polyval(poly, angle**2)
-        slope = np.polyval(poly * np.array([9, 7, 5, 3, 1]), angle**2)
-        dq_dr, dq_dz = slope * z / n2, -slope * r / n2
+    q, dq_dr, dq_dz = _RADIAL[camera.model](camera.D, r, z)
     on_axis = r < 1e-9 * np.abs(z)
     safe = np.where(on_axis, 1.0, r)
     k = np.where(on_axis, dq_dr, q / safe)
@@ -216,3 +227,69 @@ def _distort_radial(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np
     J[:, :, :2] = k[:, None, None] * np.eye(2) + ((dq_dr - k)[:, None] * e)[:, :, None] * e[:, None, :]
     J[:, :, 2] = dq_dz[:, None] * e
     return m, valid, J
+
+
+# q(r, z) with its derivatives by r and z, each (N,); and the ray (r, z) of a distorted radius, up to its length.
+
+
+def _equidistant(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
+    angle, n2 = np.arctan2(r, z), r * r + z * z
+    poly = np.array([*D[::-1], 1.0])
+    slope = np.polyval(poly * np.array([9, 7, 5, 3, 1]), angle**2)
+    return angle * np.polyval(poly, angle**2), slope * z / n2, -slope * r / n2
+
+
+def _fov(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
+    c = 2 * np.tan(D[0] / 2)
+    g = c / D[0] / (c * c * r * r + z * z)
+    return np.arctan2(c * r, z) / D[0], g * z, -g * r
+
+
+def _eucm(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
+    alpha, beta = D
+    d = np.sqrt(beta * r * r + z * z)
+    w, w_r, w_z = alpha * d + (1 - alpha) * z, alpha * beta * r / d, alpha * z / d + 1 - alpha
+    return r / w, 1 / w - r * w_r / w**2, -r * w_z / w**2
+
+
+def _double_sphere(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
+    xi, alpha = D
+    d1 = np.hypot(r, z)
+    e, e_r, e_z = xi * d1 + z, xi * r / d1, xi * z / d1 + 1
+    d2 = np.hypot(r, e)
+    w = alpha * d2 + (1 - alpha) * e
+    w_r, w_z = alpha * (r + e * e_r) / d2 + (1 - alpha) * e_r, alpha * e * e_z / d2 + (1 - alpha) * e_z
+    return r / w, 1 / w - r * w_r / w**2, -r * w_z / w**2
+
+
+def _division(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
+    root = np.sqrt(z * z - 4 * D[0] * r * r)
+    w = (z + root) / 2
+    return r / w, 1 / w + 2 * D[0] * r * r / (root * w**2), -r * (1 + z / root) / (2 * w**2)
+
+
+def _eucm_ray(D: Array, q: Array) -> tuple[Array, Array]:
+    alpha, beta = D
+    z = (1 - beta * (alpha * q) ** 2) / (alpha * np.sqrt(1 - (2 * alpha - 1) * beta * q * q) + 1 - alpha)
+    return q, z
+
+
+def _double_sphere_ray(D: Array, q: Array) -> tuple[Array, Array]:
+    xi, alpha = D
+    z = (1 - (alpha * q) ** 2) / (alpha * np.sqrt(1 - (2 * alpha - 1) * q * q) + 1 - alpha)
+    k = (z * xi + np.sqrt(z * z + (1 - xi * xi) * q * q)) / (z * z + q * q)
+    return k * q, k * z - xi
+
+
+def _division_ray(D: Array, q: Array) -> tuple[Array, Array]:
+    return q, 1 + D[0] * q * q
+
+
+_RADIAL = {
+    "equidistant": _equidistant,
+    "fov": _fov,
+    "eucm": _eucm,
+    "double_sphere": _double_sphere,
+    "division": _division,
+}
+_RAY = {"eucm": _eucm_ray, "double_sphere": _double_sphere_ray, "division": _division_ray}

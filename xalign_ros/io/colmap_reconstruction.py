@@ -38,6 +38,9 @@ _OURS = {
     "RADIAL_FISHEYE": ("equidistant", ("k1", "k2", "", "")),
     "OPENCV_FISHEYE": ("equidistant", ("k1", "k2", "k3", "k4")),
     "FOV": ("fov", ("omega",)),
+    "SIMPLE_DIVISION": ("division", ("k",)),
+    "DIVISION": ("division", ("k",)),
+    "EUCM": ("eucm", ("alpha", "beta")),
 }
 
 

@@ -31,6 +31,9 @@ DISTORTION_MODELS = {
     "rational_polynomial": "radtan",
     "equidistant": "equidistant",
     "fov": "fov",
+    "eucm": "eucm",
+    "double_sphere": "double_sphere",
+    "division": "division",
 }
 SECOND_NS = 1_000_000_000
 
