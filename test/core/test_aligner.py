@@ -194,13 +194,9 @@ def sampled_nees():
 
 
 def test_the_covariance_is_calibrated(sampled_nees):
-    """Mean NEES, 6 degrees of freedom, within 99 % of chi-square over what anchors are inflated by on purpose.
-
-    That is pnp.inflation, and 7 % from the floor of the robust scale and the degrees of freedom at 150 matches.
-    """
+    """Mean NEES, 6 degrees of freedom, within 99 % of chi-square."""
     assert len(sampled_nees) >= 75
-    want = 6 / (CONFIG.pnp.inflation * 1.07)
-    assert sampled_nees.mean() == pytest.approx(want, abs=2.58 * np.sqrt(12 / len(sampled_nees)) * want / 6)
+    assert sampled_nees.mean() == pytest.approx(6, abs=2.58 * np.sqrt(12 / len(sampled_nees)))
 
 
 # States -------------------------------------------------------------------------------------------------------------

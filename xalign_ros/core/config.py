@@ -53,13 +53,13 @@ class Pnp:
     threshold_sigmas: float = option(4.0, "1", "inlier threshold in standard deviations of a match", 1.0, 20.0)
     iterations: int = option(1000, "1", "RANSAC iterations at most", 10, 1000000)
     max_rms_sigmas: float = option(
-        2.5, "1", "root mean square of the inliers, in standard deviations, at most", 0.5, 20.0
+        5.0, "1", "root mean square of the inliers, in standard deviations, at most", 0.5, 20.0
     )
     max_sigma_ratio: float = option(0.1, "1", "position sigma over median depth, beyond it degenerate", 0.001, 1.0)
     max_runner_up: float = option(
         0.75, "1", "inliers of the second best place over those of the best, at most", 0.0, 1.0
     )
-    inflation: float = option(1.2, "1", "factor on the anchor covariance for what its model leaves out", 1.0, 100.0)
+    inflation: float = option(1.0, "1", "factor on the anchor covariance for what its model leaves out", 1.0, 100.0)
 
 
 @dataclass(frozen=True, slots=True)

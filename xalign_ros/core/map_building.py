@@ -212,8 +212,9 @@ def _anchor_sigma(
     if len(error) < FOLDS:
         return 0.0, 0.0
     spread = (1.4826 * np.median(np.abs(error), axis=0)) ** 2
-    excess = np.maximum(spread - np.median(own, axis=0), 0)
-    return float(np.sqrt(excess[:3].mean())), float(np.sqrt(excess[3:].mean()))
+    excess = spread - np.median(own, axis=0)  # of one axis below zero by chance as often as above
+    rotation, translation = np.sqrt(np.maximum([excess[:3].mean(), excess[3:].mean()], 0))
+    return float(rotation), float(translation)
 
 
 def _descriptor_gate(observed: np.ndarray, of_point: np.ndarray, norm: Norm) -> float:

@@ -18,8 +18,9 @@ from xalign_ros.core.transforms import SE3
 
 MAX_RAY_RAD = np.deg2rad(80.0)  # of a virtual pinhole
 CLEAR_MAJORITY = 0.9  # of the matches, and twice the inliers that an anchor needs
-SWEEPS = 6  # at most, of each: Cauchy weights over all matches, then the inliers alone
-CAUCHY = 2.0  # standard deviations
+SWEEPS = 10  # at most
+CAUCHY = 3.0  # standard deviations
+LEAST_SCALE = 0.3  # of the residuals' scale over what the features say of themselves
 CONVERGED = 0.01  # length of a step in standard deviations of the pose
 
 
@@ -79,39 +80,41 @@ def estimate_pose(m: Points2D3D, camera: Camera, seed: int, config: Pnp, start: 
 
 
 def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> Pose | str:
-    """Iteratively reweighted least squares in pixels over all matches, then over the inliers alone.
+    """Iteratively reweighted least squares in pixels under Cauchy's loss, cut off at the inlier threshold.
 
-    A residual's covariance is sigma_px^2 I + J R^T cov R J^T: the map point's own uncertainty is in it. The covariance
-    is the inverse normal matrix, times the squared robust scale of the residuals where that is above one.
+    A residual's covariance is sigma_px^2 I + J R^T cov R J^T, the map point's own uncertainty is in it, times a scale
+    that the residuals tell: the median length of two Gaussian components is 1.1774 sigma (Rayleigh). The covariance is
+    that of an M-estimator, A/B^2 (J^T J)^-1 with the means A of psi^2 and B of psi' over the inliers (Huber and Ronchetti,
+    Robust Statistics, 2009, section 7.6), so that it holds for tails heavier than Gaussian ones, too; `few` is their
+    correction for few residuals, and what an estimated scale adds to the mean NEES.
     """
-    gate = config.threshold_sigmas
-    for robust in (True, False):
-        W = _whitening(T_map_cam, m, camera)
-        for _ in range(SWEEPS):
-            r, J, size, _ = _residuals(T_map_cam, m, camera, W)
-            if (size < gate).sum() < config.min_inliers:
-                return "too_few_inliers"
-            weight = 1 / (1 + (size / CAUCHY) ** 2) if robust else np.where(size < gate, 1.0, 0.0)
-            Jw = J * weight[:, None, None]
-            H = np.tensordot(Jw, J, ((0, 1), (0, 1)))
-            g = np.tensordot(Jw, r, ((0, 1), (0, 1)))
-            step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -g)
-            T_map_cam = T_map_cam @ SE3.exp(step)
-            if -step @ g < CONVERGED**2:
-                break
-    r, J, size, error_px = _residuals(T_map_cam, m, camera, W)
-    inlier = size < gate
-    if inlier.sum() < config.min_inliers:
-        return "too_few_inliers"
-    H = np.tensordot(J[inlier], J[inlier], ((0, 1), (0, 1)))
+    gate, scale = config.threshold_sigmas, 1.0
+    W = _whitening(T_map_cam, m, camera)
+    for sweep in range(SWEEPS):
+        r, J, size, error_px = _residuals(T_map_cam, m, camera, W)
+        inlier = size < gate * scale
+        if inlier.sum() < config.min_inliers:
+            return "too_few_inliers"
+        scale = max(float(np.median(size[inlier])) / 1.1774, LEAST_SCALE)
+        u2 = (size[inlier] / scale) ** 2
+        weight = 1 / (1 + u2 / CAUCHY**2)
+        Ji, ri = J[inlier], r[inlier]
+        H = np.tensordot(Ji * weight[:, None, None], Ji, ((0, 1), (0, 1)))
+        g = np.tensordot(Ji, weight[:, None] * ri, ((0, 1), (0, 1)))
+        step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -g)
+        if sweep and -step @ g < (CONVERGED * scale) ** 2:
+            break
+        T_map_cam = T_map_cam @ SE3.exp(step)
+    H = np.tensordot(Ji, Ji, ((0, 1), (0, 1)))
     eigen = np.linalg.eigvalsh(H)
     depth = float(np.median((m.xyz[inlier] - T_map_cam.t) @ T_map_cam.R[:, 2]))
     if eigen[0] <= 1e-12 * eigen[-1]:
         return "degenerate"
-    # Median length of a residual with two degrees of freedom is 1.1774 sigma (Rayleigh).
-    scale = max(1.0, float(np.median(size[inlier])) / 1.1774)
-    degrees = len(r[inlier]) * 2 / max(len(r[inlier]) * 2 - 6, 1)
-    cov = np.linalg.inv(H) * scale**2 * degrees * config.inflation
+    A, curvature = float((weight**2 * u2).mean()) / 2, weight - weight**2 * u2 / CAUCHY**2
+    B, numbers = float(curvature.mean()), 2 * len(u2)
+    few = numbers / (numbers - 8) * (1 + 6 / numbers * float(curvature.var()) / B**2) ** 2
+    spread = A / B**2 if scale > LEAST_SCALE else max(A / B**2, 1.0)
+    cov = np.linalg.inv(H) * scale**2 * spread * few * config.inflation
     rms_sigmas = float(np.sqrt((size[inlier] ** 2).mean() / 2))
     if rms_sigmas > config.max_rms_sigmas:
         return "high_residual"
