@@ -63,7 +63,7 @@ check: $(STAMP)
 
 bench: $(STAMP)
 	$(PY) -m pip install -q pytheia==1.2.1
-	$(PY) bench/main_job.py; main=$$?; $(PY) bench/graph.py && exit $$main
+	$(PY) bench/main_job.py; main=$$?; $(PY) bench/anchors.py || main=1; $(PY) bench/graph.py && exit $$main
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info demo_report .mypy_cache .pytest_cache .ruff_cache .hypothesis
