@@ -62,7 +62,7 @@ check: $(STAMP)
 	$(VENV)/bin/mypy
 
 bench: $(STAMP)
-	$(PY) -m pip install -q pytheia==1.2.1
+	$(PY) -m pip install -q pytheia==1.2.1 faiss-cpu
 	$(PY) bench/main_job.py; main=$$?; $(PY) bench/anchors.py || main=1; $(PY) bench/graph.py && exit $$main
 
 clean:

@@ -45,12 +45,16 @@ def maplab(name: str, metric: bool) -> Posed:
     return keyframes, poses
 
 
-def hololens(kind: str, count: int = 1000) -> Posed:
+def hololens(kind: str, count: int = 1000, contrast: float = 0.04) -> Posed:
     """hololens_000 with `count` OpenCV features an image: "sift" or "orb"."""
     folder = data_dir() / "hololens_000"
     K = np.loadtxt(folder / "K.txt")
     matrices = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4)
-    detector = cv2.SIFT_create(nfeatures=count) if kind == "sift" else cv2.ORB_create(nfeatures=count)
+    detector = (
+        cv2.SIFT_create(nfeatures=count, contrastThreshold=contrast)
+        if kind == "sift"
+        else cv2.ORB_create(nfeatures=count)
+    )
     keyframes, poses = [], []
     for n, (path, M) in enumerate(zip(sorted((folder / "images").glob("*.png")), matrices, strict=True)):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -65,6 +69,35 @@ def hololens(kind: str, count: int = 1000) -> Posed:
         keyframes.append(Keyframe(int(path.stem) * 1_000_000_000 // 30, 0, n, T, camera, features))
         poses.append(T)
     return keyframes, poses
+
+
+def tum() -> Posed:
+    """tum_fr3_office with SIFT features; truth is the nearest row, and an image more than 20 ms from any is left out."""
+    folder = data_dir() / "tum_fr3_office"
+    truth = np.loadtxt(folder / "groundtruth_full.txt")
+    camera = Camera("radtan", [535.4, 539.2, 320.1, 247.6], [], 640, 480)
+    detector, keyframes, poses = cv2.SIFT_create(nfeatures=2000), [], []
+    for path in sorted(folder.glob("*.png")):
+        stamp = float(path.stem)
+        row = truth[np.abs(truth[:, 0] - stamp).argmin()]
+        if abs(row[0] - stamp) > 0.02:
+            continue
+        points, descriptors = detector.detectAndCompute(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), None)
+        features = Features(np.array([p.pt for p in points]), descriptors.astype(np.uint8), "sift", Norm.L2_UINT8)
+        T = SE3.from_quat(row[4:], row[1:4])
+        keyframes.append(Keyframe(round(stamp * 1e9), 0, len(keyframes), T, camera, features))
+        poses.append(T)
+    return keyframes, poses
+
+
+def every_other(posed: Posed) -> tuple[Posed, Posed]:
+    keyframes, poses = posed
+    return (keyframes[::2], poses[::2]), (keyframes[1::2], poses[1::2])
+
+
+def halves(posed: Posed) -> tuple[Posed, Posed]:
+    (keyframes, poses), n = posed, len(posed[0]) // 2
+    return (keyframes[:n], poses[:n]), (keyframes[n:], poses[n:])
 
 
 def with_odometry(posed: Posed, seed: int, *, wander: float = 0.0) -> tuple[list[Keyframe], list[float]]:

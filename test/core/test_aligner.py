@@ -12,6 +12,7 @@ import worlds
 
 from xalign_ros.core import aligner as module
 from xalign_ros.core.aligner import Aligner
+from xalign_ros.core.anchor import Sighting
 from xalign_ros.core.config import Config, with_options
 from xalign_ros.core.odometry import pose_covariance
 from xalign_ros.core.records import Anchor, Features, Keyframe, Rejection, State
@@ -194,9 +195,9 @@ def sampled_nees():
 
 
 def test_the_covariance_is_calibrated(sampled_nees):
-    """Mean NEES, 6 degrees of freedom, within 99 % of chi-square."""
+    """Mean NEES, 6 degrees of freedom: no more than 99 % of chi-square allow, and no more than a quarter too careful."""
     assert len(sampled_nees) >= 75
-    assert sampled_nees.mean() == pytest.approx(6, abs=2.58 * np.sqrt(12 / len(sampled_nees)))
+    assert 4.5 < sampled_nees.mean() < 6 + 2.58 * np.sqrt(12 / len(sampled_nees))
 
 
 # States -------------------------------------------------------------------------------------------------------------
@@ -381,7 +382,7 @@ def evidence(monkeypatch):
             return Rejection(*who, "too_few_matches", "none drawn") if found is None else found
 
         monkeypatch.setattr(module, "find_guided", find)
-        monkeypatch.setattr(module, "find_anywhere", find)
+        monkeypatch.setattr(module, "sight", lambda keyframe, *_: (find(keyframe), Sighting(keyframe, ())))
         aligner, steps = Aligner(worlds.line().map, config), []
         for keyframe in drive.keyframes:
             steps.append(aligner.step(keyframe))

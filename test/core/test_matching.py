@@ -45,7 +45,8 @@ def one_to_one(matches):
 
 
 def guided(world, index, T_predicted, features, cov=TIGHT, config=CONFIG):
-    return guided_matches(features, worlds.CAMERA, index, T_predicted, cov, worlds.SIGMA_PX, config)
+    points = index.visible_points(T_predicted, index.keyframes_near(T_predicted, config.guided_keyframes))
+    return guided_matches(features, worlds.CAMERA, index.map, points, T_predicted, cov, worlds.SIGMA_PX, config)[0]
 
 
 # Guided -------------------------------------------------------------------------------------------------------------
@@ -71,7 +72,7 @@ def test_guided_search_follows_the_predicted_covariance(world, index):
 
 
 def test_guided_search_does_not_reach_beyond_its_largest_radius(world, index):
-    """However wide the covariance: 0.4 rad off, 170 px, is beyond 80 px."""
+    """However wide the covariance: 0.4 rad off, 170 px, is beyond 150 px."""
     T = world.truth[12]
     features, _ = seen(world, T)
     m = guided(world, index, T @ SE3.exp([0, 0.4, 0, 0, 0, 0]), features, np.eye(6))
@@ -109,6 +110,8 @@ def twin_map(world, distance_m):
         point += [rows[s], np.where(rows[s] >= 0, rows[s] + count, -1)]
     return replace(
         m,
+        visibility=None,
+        vocabulary=None,
         points=np.vstack([m.points, m.points + np.array([distance_m, 0, 0])]),
         point_cov=np.concatenate([m.point_cov] * 2),
         descriptors=np.vstack([m.descriptors] * 2),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
-from xalign_ros.core.anchor import find_anywhere, find_guided
+from xalign_ros.core.anchor import Sighting, find_guided, find_together, sight
 from xalign_ros.core.belief import Belief, Prediction
 from xalign_ros.core.config import Config
 from xalign_ros.core.intake import begins_session, carries_pose, refusal
@@ -24,6 +26,8 @@ from xalign_ros.core.smoothing import eased
 from xalign_ros.core.status import score
 from xalign_ros.core.transforms import Sim3
 
+TOGETHER = 5  # keyframes that are looked for at once
+
 
 class Aligner:
     """One map, one odometry; `step` once per keyframe, in order of arrival."""
@@ -33,6 +37,7 @@ class Aligner:
         self.index = MapIndex(map_)
         self.belief = Belief(self.config)
         self._published: Sim3 | None = None  # the last S_map_odom, for a jump to start from
+        self._sightings: deque[Sighting] = deque(maxlen=TOGETHER)  # of the newest keyframes, while there is no lock
         self._counts = {"keyframes": 0, "accepted": 0, "rejected": 0}
 
     def step(self, keyframe: Keyframe | None, fault: Rejection | None = None) -> Step:
@@ -49,6 +54,7 @@ class Aligner:
         if earlier and begins_session(keyframe, earlier[-1]):
             self.belief.begin(State.LOST, f"the odometry began session {keyframe.session}")
             self._published = None
+            self._sightings.clear()
             earlier = []
         refused = refusal(keyframe, earlier, self.index.map)
         if refused is not None and not carries_pose(refused):
@@ -60,14 +66,22 @@ class Aligner:
 
     def _find_anchor(self, keyframe: Keyframe, predicted: Prediction | None) -> Anchor | Rejection:
         """Guided around the prediction while there is one; over the whole map when not, or when coasting in vain."""
-        if predicted is None:
-            return find_anywhere(keyframe, self.index, self.config)
-        S, cov = predicted
-        found = find_guided(keyframe, self.index, S.rigid_pose(), pose_covariance(S, cov), self.config)
-        if isinstance(found, Anchor) or self.belief.judged(pose_covariance(S, cov))[0] is State.LOCALIZED:
-            return found
-        anywhere = find_anywhere(keyframe, self.index, self.config)
-        return anywhere if isinstance(anywhere, Anchor) else found
+        if predicted is not None:
+            S, cov = predicted
+            found = find_guided(keyframe, self.index, S.rigid_pose(), pose_covariance(S, cov), self.config)
+            state = self.belief.judged(pose_covariance(S, cov))[0]
+            if isinstance(found, Anchor) or state is State.LOCALIZED:
+                self._sightings.clear()
+                return found
+        anywhere, sighting = sight(keyframe, self.index, self.config)
+        self._sightings.append(sighting)
+        if predicted is not None and state is not State.LOST:
+            return anywhere if isinstance(anywhere, Anchor) else found
+        if len(self._sightings) >= self.config.lock.anchors:
+            together = find_together(tuple(self._sightings), self.index, self.config)
+            self.belief.remember(together)
+            return anywhere if isinstance(anywhere, Anchor) else together.get(keyframe.id, anywhere)
+        return anywhere
 
     def _correction(self, keyframe: Keyframe) -> Correction | None:
         """The newest keyframe's answer, unless the alignment is not locked or lost.

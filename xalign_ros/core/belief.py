@@ -9,7 +9,7 @@ the camera leap while the odometry ran on smoothly looks like another place: a l
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,6 +117,12 @@ class Belief:
         if self.estimate is not None:
             link.belief = self.estimate.S_map_i.rigid_pose(), self.pose_cov
         return found, believed
+
+    def remember(self, anchors: Mapping[int, Anchor]) -> None:
+        """Anchors by keyframe id that were found later than their keyframes; they wait like others."""
+        for link in self._links:
+            if link.anchor is None and link.keyframe.id in anchors:
+                link.anchor = anchors[link.keyframe.id]
 
     # -- the estimate --------------------------------------------------------------------------------------------
 

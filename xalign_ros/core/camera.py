@@ -201,13 +201,18 @@ def _distort_radtan(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np
     z = x[:, 2]
     a = x[:, :2] / z[:, None]
     valid = (z > 1e-9) & (np.einsum("ij,ij->i", a, a) <= camera.limit**2)
-    m, Ja = _radtan(_eight(camera.D), a, jacobian)
+    straight = not camera.D.any()
+    m, Ja = (a, NO_JACOBIAN) if straight else _radtan(_eight(camera.D), a, jacobian)
     if not jacobian:
         return m, valid, NO_JACOBIAN
-    da = np.zeros((len(x), 2, 3))
-    da[:, 0, 0] = da[:, 1, 1] = 1 / z
-    da[:, :, 2] = -a / z[:, None]
-    return m, valid, Ja @ da
+    J = np.zeros((len(x), 2, 3))
+    if straight:
+        J[:, [0, 1], [0, 1]] = 1 / z[:, None]
+        J[:, :, 2] = -a / z[:, None]
+    else:
+        J[:, :, :2] = Ja / z[:, None, None]
+        J[:, :, 2] = -np.einsum("nij,nj->ni", Ja, a) / z[:, None]
+    return m, valid, J
 
 
 def _distort_radial(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:

@@ -36,7 +36,7 @@ class Matching:
     cold_ratio: float = option(0.85, "1", "the same, within one place of the map", 0.1, 1.0)
     guided_keyframes: int = option(20, "1", "map keyframes near the prediction whose points are searched", 1, 1000)
     guided_radius_px: float = option(8.0, "px", "smallest search radius around a predicted pixel", 1.0, 500.0)
-    guided_radius_max_px: float = option(80.0, "px", "largest search radius around a predicted pixel", 1.0, 2000.0)
+    guided_radius_max_px: float = option(150.0, "px", "largest search radius around a predicted pixel", 1.0, 2000.0)
     cold_features: int = option(300, "1", "features that vote for places of the whole map", 10, 100000)
     cold_places: int = option(3, "1", "places tried by a search over the whole map", 1, 50)
     place_keyframes: int = option(12, "1", "covisible map keyframes that make up one place", 1, 1000)
@@ -47,7 +47,13 @@ class Pnp:
     """Absolute pose from 2D-3D matches."""
 
     min_inliers: int = option(
-        30, "1", "fewest inliers of an anchor; chance gives up to 8, a glimpse of the map too few to be true", 6, 10000
+        30, "1", "fewest inliers around a predicted pose, where a glimpse of the map is too little", 6, 10000
+    )
+    cold_inliers: int = option(
+        12, "1", "fewest matches that agree within a place of the whole map; chance gives up to 8", 6, 10000
+    )
+    min_spread: float = option(
+        4.0, "1", "matches within two sigma, times the part of the image they cover, at least", 0.0, 10000.0
     )
     sigma_px: float = option(1.0, "px", "keypoint noise where the features do not give their own", 0.05, 20.0)
     threshold_sigmas: float = option(4.0, "1", "inlier threshold in standard deviations of a match", 1.0, 20.0)

@@ -8,6 +8,7 @@ from xalign_ros.core.lie import Array
 from xalign_ros.core.records import Norm
 
 CACHED = 1 << 16  # distances computed at a time
+DENSE = 0.02  # part of all pairs beyond which computing them all is the faster way
 
 
 def pair_distance(a: np.ndarray, b: np.ndarray, norm: Norm) -> Array:
@@ -21,12 +22,38 @@ def pair_distance(a: np.ndarray, b: np.ndarray, norm: Norm) -> Array:
     return np.asarray(np.linalg.norm(x - y, axis=1), float)
 
 
+def indexed_distance(a: np.ndarray, b: np.ndarray, i: np.ndarray, j: np.ndarray, norm: Norm) -> Array:
+    """Distances (P,) of rows i (P,) of a (N, B) to rows j (P,) of b (M, B)."""
+    if norm is Norm.HAMMING:
+        return differing_bits(columns(a), columns(b), i, j).astype(float)
+    if len(i) < DENSE * len(a) * len(b):
+        return pair_distance(a[i], b[j], norm)
+    if norm is Norm.COSINE_FLOAT32:
+        return np.asarray(1 - (unit(a) @ unit(b).T)[i, j], float)
+    x, y = a.astype(np.float32), b.astype(np.float32)
+    squared = np.einsum("ij,ij->i", x, x)[i] + np.einsum("ij,ij->i", y, y)[j] - 2 * (x @ y.T)[i, j]
+    return np.asarray(np.sqrt(np.maximum(squared, 0)), float)
+
+
+def columns(codes: np.ndarray) -> np.ndarray:
+    """Bits of rows (N, B) as columns (W, N) of the longest machine words that a row is made of."""
+    return np.ascontiguousarray(_words(codes).T)
+
+
+def differing_bits(a: np.ndarray, b: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Hamming distances (P,) uint16 of the codes i of columns a (W, N) to the codes j of columns b (W, M)."""
+    bits = np.zeros(len(i), np.uint16)
+    for x, y in zip(a, b, strict=True):
+        bits += np.bitwise_count(x[i] ^ y[j])
+    return bits
+
+
 def nearest(query: np.ndarray, train: np.ndarray, norm: Norm, count: int) -> tuple[np.ndarray, Array]:
     """The `count` nearest rows of train (M, B) to each row of query (N, B): index (N, count) and distance (N, count)."""
     count = min(count, len(train))
     if norm is Norm.COSINE_FLOAT32:
         # For unit vectors L2^2 = 2 (1 - cosine): same order, and the distance converts exactly.
-        index, d = nearest(_unit(query), _unit(train), Norm.L2_FLOAT32, count)
+        index, d = nearest(unit(query), unit(train), Norm.L2_FLOAT32, count)
         return index, d * d / 2
     if norm is not Norm.HAMMING:
         return _nearest_l2(query.astype(np.float32), train.astype(np.float32), count)
@@ -35,14 +62,14 @@ def nearest(query: np.ndarray, train: np.ndarray, norm: Norm, count: int) -> tup
 
 def _nearest_hamming(query: np.ndarray, train: np.ndarray, count: int) -> tuple[np.ndarray, Array]:
     """XOR and population count, a machine word at a time, over blocks that stay in the processor's cache."""
-    words, columns = _words(query), np.ascontiguousarray(_words(train).T)
+    words, trained = _words(query), columns(train)
     block = max(1, CACHED // max(len(train), 1))
     index = np.empty((len(query), count), np.int64)
     distance = np.empty((len(query), count))
     for start in range(0, len(query), block):
         q = words[start : start + block]
         d = np.zeros((len(q), len(train)), np.uint16)
-        for n, column in enumerate(columns):
+        for n, column in enumerate(trained):
             d += np.bitwise_count(column ^ q[:, n, None])
         rows = np.arange(len(q))
         for k in range(count):
@@ -88,7 +115,7 @@ def nearest_to_mean(descriptors: np.ndarray, group: np.ndarray, count: int, norm
     return np.asarray(order[best[start]])
 
 
-def _unit(x: np.ndarray) -> np.ndarray:
+def unit(x: np.ndarray) -> np.ndarray:
     return np.asarray(x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12), np.float32)
 
 

@@ -84,4 +84,6 @@ def without_keyframes(map_: ReferenceMap, held: np.ndarray) -> ReferenceMap:
         point_cov=points.cov[points.kept].astype(np.float32),
         descriptors=map_.feature_descriptors[seen[best]],
         feature_point=feature_point,
+        visibility=None,
+        vocabulary=None,
     )

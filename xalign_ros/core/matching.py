@@ -5,69 +5,117 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.config import Matching
-from xalign_ros.core.descriptors import nearest, pair_distance
+from xalign_ros.core.descriptors import indexed_distance, nearest
 from xalign_ros.core.lie import Array, hat
 from xalign_ros.core.records import Features
-from xalign_ros.core.reference_map import MapIndex
+from xalign_ros.core.reference_map import MapIndex, ReferenceMap
 from xalign_ros.core.transforms import SE3
 
+ELLIPSE_SIGMAS = 3.0  # that a prediction is searched within
+SAMPLED = 50  # points that tell how large the ellipses are
+LEAST_BAND_PX = 40.0  # more bands cost more than they save
 SAME_POINT_RATIO = 0.01  # points closer than this part of their distance to the camera are one point seen twice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """feature (N,) of the keyframe and point (N,) of the map, one to one."""
+    """feature (N,) of the keyframe and point (N,) of the map, one to one, at this distance (N,) of their descriptors."""
 
     feature: np.ndarray
     point: np.ndarray
+    distance: Array
 
     def __len__(self) -> int:
         return len(self.feature)
 
 
-NO_MATCHES = Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
+NO_MATCHES = Matches(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
 
 
 def guided_matches(
     features: Features,
     camera: Camera,
-    index: MapIndex,
+    map_: ReferenceMap,
+    points: np.ndarray,
     T_map_cam: SE3,
     cov_cam: Array,
     sigma_px: float,
     config: Matching,
-) -> Matches:
-    """Matches inside the ellipse that the predicted pose's covariance (6, 6), camera axes, puts around each map point.
+    most_pairs: float = np.inf,
+) -> tuple[Matches, bool]:
+    """Matches inside the ellipse that the predicted pose's covariance (6, 6), camera axes, puts around each of the points.
 
-    The ellipse is searched as a circle of its larger half axis (three sigma), kept to one to one with a ratio test.
+    One to one, with a ratio test against the best pair with a different point. Where more than most_pairs of a feature and
+    a point are to be expected, only every n-th point is looked for. Returns whether all were.
     """
-    map_ = index.map
-    points = index.points_of(index.keyframes_near(T_map_cam, config.guided_keyframes))
     x_cam = (map_.points[points] - T_map_cam.t) @ T_map_cam.R
-    uv, valid = camera.project(x_cam)
+    uv, valid, J = camera.project_with_jacobian(x_cam)
     seen = np.flatnonzero(valid & camera.inside(uv, config.guided_radius_px))
     if not len(seen):
-        return NO_MATCHES
-    points, x_cam = points[seen], x_cam[seen]
-    uv, _, J = camera.project_with_jacobian(x_cam)
+        return NO_MATCHES, True
+    image = camera.width * camera.height
+    some = seen[:: max(1, len(seen) // SAMPLED)]
+    area = np.pi * np.sqrt(np.linalg.det(_spread(x_cam[some], J[some], cov_cam, sigma_px, config))).mean()
+    step = max(1, int(np.ceil(len(seen) * len(features) * ELLIPSE_SIGMAS**2 * area / image / most_pairs)))
+    seen = seen[::step]
+    points, uv, S = points[seen], uv[seen], _spread(x_cam[seen], J[seen], cov_cam, sigma_px, config)
+    feature, at = _inside_ellipses(features.uv, uv, S, max(config.guided_radius_max_px, camera.width / 10))
+    distance = indexed_distance(features.descriptors, map_.descriptors[points], feature, at, map_.norm)
+    matches = _one_to_one(
+        feature, points[at], distance, config.guided_ratio, map_.points, T_map_cam.t, map_.descriptor_gate
+    )
+    return matches, step == 1
+
+
+def _spread(x_cam: Array, J: Array, cov_cam: Array, sigma_px: float, config: Matching) -> Array:
+    """Covariance (N, 2, 2) px of where points (N, 3) of the camera's frame are seen, J (N, 2, 3) that of the projection."""
     J_pose = np.concatenate([J @ hat(x_cam), -J], axis=2)
-    spread = ((J_pose @ cov_cam) * J_pose).sum(axis=(1, 2))  # the trace, which is over the larger eigenvalue
-    radius = np.clip(
-        3 * np.sqrt(spread + 2 * sigma_px**2),
-        config.guided_radius_px,
-        max(config.guided_radius_max_px, camera.width / 10),
-    )
-    pairs = cKDTree(uv).sparse_distance_matrix(cKDTree(features.uv), float(radius.max()), output_type="ndarray")
-    pairs = pairs[pairs["v"] <= radius[pairs["i"]]]
-    row, column = pairs["i"], pairs["j"]
-    distance = pair_distance(features.descriptors[column], map_.descriptors[points[row]], map_.norm)
-    return _one_to_one(
-        column, points[row], distance, config.guided_ratio, map_.points, T_map_cam.t, map_.descriptor_gate
-    )
+    least = max(2 * sigma_px**2, (config.guided_radius_px / ELLIPSE_SIGMAS) ** 2)
+    S: Array = np.einsum("nij,nkj->nik", (J_pose.reshape(-1, 6) @ cov_cam).reshape(-1, 2, 6), J_pose)
+    return S + least * np.eye(2)
+
+
+def _inside_ellipses(uv: Array, centre: Array, S: Array, most_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (row of uv (N, 2), row of centre (M, 2)) where uv is in the centre's ellipse of ELLIPSE_SIGMAS of S (M, 2, 2).
+
+    Ellipses longer than most_px are shrunk to it. Rows of uv are looked up by bands of the image, in each by order of x.
+    """
+    largest = (S[:, 0, 0] + S[:, 1, 1]) / 2 + np.hypot((S[:, 0, 0] - S[:, 1, 1]) / 2, S[:, 0, 1])
+    S = S * np.minimum(ELLIPSE_SIGMAS**2, most_px**2 / largest)[:, None, None]
+    a, b, c = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
+    half_u, half_v, determinant = np.sqrt(a), np.sqrt(c), a * c - b * b
+    # (c du^2 - 2 b du dv + a dv^2) / determinant <= 1
+    weights = np.stack([c, -2 * b, a]) / determinant
+    height = max(float(np.median(half_v)), LEAST_BAND_PX)
+    band = np.floor(uv[:, 1] / height).astype(np.int64)
+    order = np.lexsort((uv[:, 0], band))
+    (u, v), (u_0, v_0) = uv[order].T, centre.T
+    left, right = u_0 - half_u, u_0 + half_u
+    low, high = v_0 - half_v, v_0 + half_v
+    begin = np.searchsorted(band[order], np.arange(band[order[0]], band[order[-1]] + 2))
+    rows, centres = [], []
+    for n, edge in enumerate(height * np.arange(band[order[0]], band[order[-1]] + 1)):
+        own = slice(begin[n], begin[n + 1])
+        near = np.flatnonzero((high >= edge) & (low <= edge + height))
+        first = begin[n] + np.searchsorted(u[own], left[near])
+        counts = begin[n] + np.searchsorted(u[own], right[near]) - first
+        row = np.repeat(first - np.cumsum(counts) + counts, counts)
+        row += np.arange(len(row))
+        at = np.repeat(near, counts)
+        du, dv = u[row] - u_0[at], v[row] - v_0[at]
+        q = weights[0, at] * du
+        q += weights[1, at] * dv
+        q *= du
+        dv *= dv
+        dv *= weights[2, at]
+        q += dv
+        inside = np.flatnonzero(q <= 1)
+        rows.append(order[row[inside]])
+        centres.append(at[inside])
+    return np.concatenate(rows), np.concatenate(centres)
 
 
 def place_matches(features: Features, index: MapIndex, keyframes: np.ndarray, config: Matching) -> Matches:
@@ -92,8 +140,8 @@ def places(features: Features, index: MapIndex, config: Matching) -> list[np.nda
     """
     map_ = index.map
     chosen = np.unique(np.linspace(0, len(features) - 1, min(len(features), config.cold_features)).astype(int))
-    found, distance = nearest(features.descriptors[chosen], map_.descriptors, map_.norm, 2)
-    points = found[distance <= map_.descriptor_gate]
+    _, points, distance = index.vocabulary.nearest(features.descriptors[chosen], map_.descriptors, map_.norm, 2)
+    points = points[distance <= map_.descriptor_gate]
     result = []
     for _ in range(config.cold_places):
         votes = index.votes(points)
@@ -110,8 +158,10 @@ def _one_to_one(
     feature: np.ndarray, point: np.ndarray, distance: Array, ratio: float, xyz: Array, eye: Array, gate: float
 ) -> Matches:
     """Mutual best pairs whose distance is below `ratio` times that of the feature's best pair with a different point."""
-    if not len(feature):
+    some = np.flatnonzero(distance * ratio <= gate)  # a runner-up beyond this cannot fail a pair within the gate
+    if not len(some):
         return NO_MATCHES
+    feature, point, distance = feature[some], point[some], distance[some]
     order = np.lexsort((point, distance, feature))
     f, p, d = feature[order], point[order], distance[order]
     first = np.flatnonzero(np.r_[True, np.diff(f) > 0])
@@ -127,4 +177,4 @@ def _one_to_one(
     keep = keep[order]
     keep = keep[np.r_[True, np.diff(p[keep]) > 0]] if len(keep) else keep
     keep = keep[np.argsort(f[keep], kind="stable")]
-    return Matches(f[keep], p[keep])
+    return Matches(f[keep], p[keep], d[keep])

@@ -11,6 +11,60 @@ from xalign_ros.core.camera import Camera
 from xalign_ros.core.lie import Array
 from xalign_ros.core.records import Norm
 from xalign_ros.core.transforms import SE3, Sim3
+from xalign_ros.core.vocabulary import Vocabulary
+
+LEAST_VIEW_COSINE = (
+    0.5  # to the mean direction that a point was seen from (ORB-SLAM, Mur-Artal et al. 2015, section V-D)
+)
+MOST_ZOOM = 2.0  # times nearer or farther than a point was seen from
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visibility:
+    """Which points (O,) keyframe k sees, keyframe_point[keyframe_offset[k]:keyframe_offset[k + 1]], and the other way round.
+
+    median_depth (K,) m is that of what a keyframe sees, the map's own where it sees nothing. A point is seen from the
+    mean direction view (M, 3), of length 1, and from distances (M, 2) m, least and greatest.
+    """
+
+    point_keyframe: np.ndarray
+    point_offset: np.ndarray
+    keyframe_point: np.ndarray
+    keyframe_offset: np.ndarray
+    median_depth: Array
+    view: Array
+    distances: Array
+
+    @staticmethod
+    def of(map_: ReferenceMap) -> Visibility:
+        seen = np.flatnonzero(np.asarray(map_.feature_point) >= 0)
+        point = np.asarray(map_.feature_point)[seen].astype(np.int64)
+        keyframe = np.searchsorted(map_.feature_offset, seen, side="right") - 1
+        ray = map_.points[point] - map_.keyframe_t[keyframe]
+        depth = np.einsum("ij,ij->i", map_.keyframe_R[keyframe, :, 2], ray)
+        keyframe_offset = np.searchsorted(seen, map_.feature_offset)
+        median = np.array([np.median(depth[a:b]) if b > a else np.nan for a, b in itertools.pairwise(keyframe_offset)])
+        median[np.isnan(median)] = np.nanmedian(median) if len(depth) else 1.0
+        order = np.argsort(point, kind="stable")
+        count = len(map_.points)
+        point_offset = np.searchsorted(point[order], np.arange(count + 1))
+        length = np.linalg.norm(ray, axis=1)
+        view = np.stack([np.bincount(point, -ray[:, n] / length, minlength=count) for n in range(3)], axis=1)
+        view = view / np.maximum(np.linalg.norm(view, axis=1, keepdims=True), 1e-12)
+        distances = np.zeros((count, 2))
+        own = np.flatnonzero(np.diff(point_offset))
+        if len(own):
+            distances[own, 0] = np.minimum.reduceat(length[order], point_offset[own])
+            distances[own, 1] = np.maximum.reduceat(length[order], point_offset[own])
+        return Visibility(
+            keyframe[order].astype(np.int32),
+            point_offset,
+            point.astype(np.int32),
+            keyframe_offset,
+            median,
+            view.astype(np.float32),
+            distances.astype(np.float32),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,7 +75,8 @@ class ReferenceMap:
     T_map_cam; features of keyframe k are rows feature_offset[k]:feature_offset[k+1] of feature_uv (F, 2) px,
     feature_descriptors (F, B) and feature_point (F,), -1 = none. sigma_px is the robust reprojection residual of the
     map's own observations; anchor_sigma = (rad, m) what a held-out keyframe's anchor errs beyond its covariance;
-    descriptor_gate the distance below which two descriptors may be of one point. Raises ValueError on wrong shapes.
+    descriptor_gate the distance below which two descriptors may be of one point. visibility and vocabulary are of these
+    very arrays: None where the arrays are changed. Raises ValueError on wrong shapes.
     """
 
     map_id: str
@@ -46,6 +101,8 @@ class ReferenceMap:
     descriptor_gate: float
     anchor_sigma: tuple[float, float] = (0.0, 0.0)
     S_map_refmap: Sim3 = field(default_factory=Sim3.identity)
+    visibility: Visibility | None = None
+    vocabulary: Vocabulary | None = None
 
     def __post_init__(self) -> None:
         m, k, f = len(self.points), len(self.keyframe_t), len(self.feature_uv)
@@ -65,6 +122,9 @@ class ReferenceMap:
         for name, shape in want.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"map array {name} has shape {getattr(self, name).shape}, needed is {shape}")
+        v, w = self.visibility, self.vocabulary
+        if (v and (len(v.point_offset), len(v.keyframe_offset)) != (m + 1, k + 1)) or (w and len(w.word_point) != m):
+            raise ValueError("visibility or vocabulary are of another map; give None to have them made anew")
         if len(width) != 1 or k == 0 or not self.cameras:
             raise ValueError("a map needs keyframes, cameras and descriptors")
 
@@ -77,50 +137,50 @@ class ReferenceMap:
 
 
 class MapIndex:
-    """Visibility both ways, computed once per map."""
+    """What a map's observations say of what sees what, and its vocabulary; learned here where the map brings none along."""
 
     def __init__(self, map_: ReferenceMap) -> None:
         self.map = map_
-        seen = np.flatnonzero(np.asarray(map_.feature_point) >= 0)
-        point = np.asarray(map_.feature_point)[seen].astype(np.int64)
-        keyframe = np.searchsorted(map_.feature_offset, seen, side="right") - 1
-        order = np.argsort(point, kind="stable")
-        self.point_keyframe = keyframe[order]
-        self.point_offset = np.searchsorted(point[order], np.arange(len(map_.points) + 1))
-        self.keyframe_point = point
-        self.keyframe_offset = np.searchsorted(seen, map_.feature_offset)
-        axis = map_.keyframe_R[:, :, 2]
-        depth = np.einsum("ij,ij->i", axis[keyframe], map_.points[point] - map_.keyframe_t[keyframe])
-        self.median_depth = np.array(
-            [np.median(depth[a:b]) if b > a else np.nan for a, b in itertools.pairwise(self.keyframe_offset)]
-        )
-        self.median_depth[np.isnan(self.median_depth)] = np.nanmedian(self.median_depth) if len(depth) else 1.0
+        self.visibility = map_.visibility or Visibility.of(map_)
+        self._axis = np.ascontiguousarray(map_.keyframe_R[:, :, 2])
+        self.vocabulary = map_.vocabulary or Vocabulary.learn(map_.descriptors, map_.norm)
 
     def points_of(self, keyframes: np.ndarray) -> np.ndarray:
         """Sorted indices of the points seen by any of these map keyframes."""
-        seen = np.zeros(len(self.map.points), bool)
-        for k in keyframes:
-            seen[self.keyframe_point[self.keyframe_offset[k] : self.keyframe_offset[k + 1]]] = True
-        return np.flatnonzero(seen)
+        v = self.visibility
+        parts = [v.keyframe_point[v.keyframe_offset[k] : v.keyframe_offset[k + 1]] for k in keyframes]
+        return np.unique(np.concatenate(parts)).astype(np.int64) if parts else np.zeros(0, np.int64)
+
+    def visible_points(self, T_map_cam: SE3, keyframes: np.ndarray) -> np.ndarray:
+        """Points that any of these map keyframes sees and this camera might: from about that side, about as far away."""
+        points = self.points_of(keyframes)
+        ray = T_map_cam.t - self.map.points[points]
+        distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
+        cosine = np.einsum("ij,ij->i", ray, self.visibility.view[points])
+        least, most = self.visibility.distances[points].T
+        same = (cosine > LEAST_VIEW_COSINE * distance) & (distance > least / MOST_ZOOM) & (distance < most * MOST_ZOOM)
+        return np.asarray(points[same])
 
     def keyframes_near(self, T_map_cam: SE3, count: int) -> np.ndarray:
-        """Map keyframes whose view is most like this pose's, nearest first: distance over scene depth plus angle."""
-        m = self.map
-        cosine = np.clip(m.keyframe_R[:, :, 2] @ T_map_cam.R[:, 2], -1, 1)
-        distance = np.linalg.norm(m.keyframe_t - T_map_cam.t, axis=1) / self.median_depth
-        cost = distance + np.arccos(cosine)
-        return np.argsort(cost, kind="stable")[:count]
+        """Map keyframes whose view is most like this pose's, nearest first: distance over scene depth plus chord of the angle."""
+        chord = np.sqrt(np.maximum(2 - 2 * (self._axis @ T_map_cam.R[:, 2]), 0))
+        d = self.map.keyframe_t - T_map_cam.t
+        cost = np.sqrt(np.einsum("ij,ij->i", d, d)) / self.visibility.median_depth + chord
+        near = np.argpartition(cost, count)[:count] if count < len(cost) else np.arange(len(cost))
+        return near[np.lexsort((near, cost[near]))]
 
     def votes(self, points: np.ndarray) -> Array:
         """Votes (K,) of matched points for the map keyframes that see them, each point's vote shared between them."""
-        counts = self.point_offset[points + 1] - self.point_offset[points]
-        rows = np.repeat(self.point_offset[points] - np.r_[0, np.cumsum(counts)[:-1]], counts) + np.arange(counts.sum())
+        v = self.visibility
+        first = v.point_offset[points]
+        counts = v.point_offset[points + 1] - first
+        rows = np.repeat(first - np.r_[0, np.cumsum(counts)[:-1]], counts) + np.arange(counts.sum())
         weight = np.repeat(1 / np.sqrt(np.maximum(counts, 1)), counts)
-        return np.asarray(np.bincount(self.point_keyframe[rows], weight, minlength=len(self.map.keyframe_t)), float)
+        return np.asarray(np.bincount(v.point_keyframe[rows], weight, minlength=len(self.map.keyframe_t)), float)
 
     def covisible(self, keyframe: int, count: int) -> np.ndarray:
         """The map keyframes that share most points with this one, itself first."""
         shared = self.votes(self.points_of(np.array([keyframe])))
         shared[keyframe] = np.inf
-        best = np.argsort(-shared, kind="stable")[:count]
-        return best[shared[best] > 0]
+        some = np.flatnonzero(shared)
+        return some[np.argsort(-shared[some], kind="stable")][:count]

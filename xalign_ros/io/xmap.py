@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import DTypeLike
 
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.errors import MapError
 from xalign_ros.core.records import Norm
-from xalign_ros.core.reference_map import ReferenceMap
+from xalign_ros.core.reference_map import MapIndex, ReferenceMap, Visibility
 from xalign_ros.core.transforms import Sim3
+from xalign_ros.core.vocabulary import Vocabulary
 
-FORMAT = 1
+FORMAT = 2
 ARRAYS = {
     "points": "<f8",
     "point_cov": "<f4",
@@ -30,6 +32,22 @@ ARRAYS = {
     "feature_descriptors": None,
     "feature_point": "<i4",
 }
+VISIBILITY: dict[str, str | None] = {
+    "point_keyframe": "<i4",
+    "point_offset": "<i8",
+    "keyframe_point": "<i4",
+    "keyframe_offset": "<i8",
+    "median_depth": "<f8",
+    "view": "<f4",
+    "distances": "<f4",
+}
+VOCABULARY: dict[str, str | None] = {
+    "coarse": "<f4",
+    "fine": "<f4",
+    "word_offset": "<i8",
+    "word_point": "<i4",
+    "code": None,
+}  # of code: by its width
 
 
 def write_map(map_: ReferenceMap, folder: Path, *, force: bool = False) -> str:
@@ -42,8 +60,11 @@ def write_map(map_: ReferenceMap, folder: Path, *, force: bool = False) -> str:
     work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         work.chmod(0o755)
-        arrays = {name: _write_array(work, name, kind, map_) for name, kind in ARRAYS.items()}
+        arrays = {n: _write_array(work, n, getattr(map_, n), k or map_.norm.dtype) for n, k in ARRAYS.items()}
         version = hashlib.sha256("".join(a["sha256"] for a in arrays.values()).encode()).hexdigest()[:12]
+        index = MapIndex(map_)
+        for part, kinds in ((index.visibility, VISIBILITY), (index.vocabulary, VOCABULARY)):
+            arrays |= {n: _write_array(work, n, getattr(part, n), k) for n, k in kinds.items()}
         header = _header(map_, version, arrays)
         (work / "map.yaml").write_text(yaml.safe_dump(header, sort_keys=False, width=120))
         if folder.exists():
@@ -54,8 +75,8 @@ def write_map(map_: ReferenceMap, folder: Path, *, force: bool = False) -> str:
     return version
 
 
-def _write_array(work: Path, name: str, kind: str | None, map_: ReferenceMap) -> dict[str, Any]:
-    a = np.ascontiguousarray(getattr(map_, name), kind or map_.norm.dtype)
+def _write_array(work: Path, name: str, array: np.ndarray, kind: DTypeLike | None) -> dict[str, Any]:
+    a = np.ascontiguousarray(array, kind)
     path = work / f"{name}.npy"
     np.save(path, a, allow_pickle=False)
     return {"dtype": a.dtype.str, "shape": list(a.shape), "sha256": _checksum(path)}
@@ -92,7 +113,10 @@ def read_map(folder: Path, *, verify: bool = False) -> ReferenceMap:
     """
     folder = Path(folder)
     header = read_header(folder)
-    arrays = {name: _read_array(folder, name, header, verify) for name in ARRAYS}
+    arrays, seen, words = (
+        {name: _read_array(folder, name, header, verify) for name in names}
+        for names in (ARRAYS, VISIBILITY, VOCABULARY)
+    )
     try:
         S, d, a = header["T_map_refmap"], header["descriptor"], header["anchor_sigma"]
         return ReferenceMap(
@@ -109,6 +133,8 @@ def read_map(folder: Path, *, verify: bool = False) -> ReferenceMap:
             anchor_sigma=(float(a["rotation_rad"]), float(a["translation_m"])),
             S_map_refmap=Sim3(np.array(S["rotation"]), np.array(S["translation"]), S["scale"]),
             **arrays,
+            visibility=Visibility(**seen),
+            vocabulary=Vocabulary(**words),
         )
     except (KeyError, TypeError, ValueError) as e:
         raise MapError(f"{folder / 'map.yaml'} does not describe a map ({e!r}); build the map anew") from None
