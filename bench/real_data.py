@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.lie import project_rotation, so3_exp
@@ -72,19 +73,19 @@ def hololens(kind: str, count: int = 1000, contrast: float = 0.04) -> Posed:
 
 
 def tum() -> Posed:
-    """tum_fr3_office with SIFT features; truth is the nearest row, and an image more than 20 ms from any is left out."""
+    """tum_fr3_office with SIFT features; truth between its rows, and an image more than 20 ms from any is left out."""
     folder = data_dir() / "tum_fr3_office"
     truth = np.loadtxt(folder / "groundtruth_full.txt")
+    turn = Slerp(truth[:, 0], Rotation.from_quat(truth[:, 4:]))
     camera = Camera("radtan", [535.4, 539.2, 320.1, 247.6], [], 640, 480)
     detector, keyframes, poses = cv2.SIFT_create(nfeatures=2000), [], []
     for path in sorted(folder.glob("*.png")):
         stamp = float(path.stem)
-        row = truth[np.abs(truth[:, 0] - stamp).argmin()]
-        if abs(row[0] - stamp) > 0.02:
+        if np.abs(truth[:, 0] - stamp).min() > 0.02:
             continue
         points, descriptors = detector.detectAndCompute(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), None)
         features = Features(np.array([p.pt for p in points]), descriptors.astype(np.uint8), "sift", Norm.L2_UINT8)
-        T = SE3.from_quat(row[4:], row[1:4])
+        T = SE3(turn(stamp).as_matrix(), [np.interp(stamp, truth[:, 0], x) for x in truth[:, 1:4].T])
         keyframes.append(Keyframe(round(stamp * 1e9), 0, len(keyframes), T, camera, features))
         poses.append(T)
     return keyframes, poses

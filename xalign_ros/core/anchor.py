@@ -11,7 +11,7 @@ import numpy as np
 from xalign_ros.core.config import Config, Pnp
 from xalign_ros.core.lie import Array
 from xalign_ros.core.matching import NO_MATCHES, Matches, guided_matches, place_matches, places
-from xalign_ros.core.pnp import Points2D3D, Pose, estimate_pose, evidence, sample_pose
+from xalign_ros.core.pnp import Points2D3D, Pose, estimate_pose, evidence, refine_pose, sample_pose
 from xalign_ros.core.records import Anchor, Keyframe, Rejection
 from xalign_ros.core.reference_map import MapIndex
 from xalign_ros.core.transforms import SE3
@@ -78,6 +78,9 @@ class _Search:
     def pose(self, matches: Matches, config: Pnp, start: SE3) -> Pose | str:
         return estimate_pose(self.pairs(matches), self.camera, self.seed, config, start)
 
+    def refined(self, matches: Matches, T_map_cam: SE3) -> Pose | str:
+        return refine_pose(T_map_cam, self.pairs(matches), self.camera, self.few)
+
     def pairs(self, matches: Matches) -> Points2D3D:
         map_, f, p = self.index.map, matches.feature, matches.point
         return Points2D3D(self.features.uv[f], self.sigma_px[f], map_.points[p], map_.point_cov[p].astype(float))
@@ -118,9 +121,11 @@ def sight(keyframe: Keyframe, index: MapIndex, config: Config) -> tuple[Anchor |
         matches = place_matches(keyframe.features, index, place, config.matching)
         seen.append(matches)
         coarse = search.coarse(matches)
-        if isinstance(coarse, SE3):
+        found = coarse if isinstance(coarse, str) else search.refined(matches, coarse)
+        if isinstance(coarse, SE3) and _inliers(found) < config.pnp.min_inliers:  # is there more to see around it?
             matches, _ = search.around(index.visible_points(coarse, place), coarse)
-        tried.append((matches, coarse if isinstance(coarse, str) else search.pose(matches, search.few, coarse)))
+            found = search.pose(matches, search.few, coarse)
+        tried.append((matches, found))
     poses = [(m, p) for m, p in tried if isinstance(p, Pose)]
     if not poses:
         most = max(tried, key=lambda t: len(t[0]), default=(NO_MATCHES, "too_few_matches"))
@@ -131,8 +136,8 @@ def sight(keyframe: Keyframe, index: MapIndex, config: Config) -> tuple[Anchor |
     support = (np.isfinite(distance) & (config.matching.cold_ratio * distance <= distance.min(axis=0))).sum(axis=1)
     first = int(support.argmax())
     others = [int(n) for n, hypothesis in zip(support, poses, strict=True) if _elsewhere(hypothesis, poses[first])]
-    found = _result(keyframe, index, *poses[first], max(others, default=0) / int(support[first]), search.few)
-    return found, Sighting(keyframe, tuple(seen))
+    result = _result(keyframe, index, *poses[first], max(others, default=0) / int(support[first]), search.few)
+    return result, Sighting(keyframe, tuple(seen))
 
 
 def find_together(sightings: Sequence[Sighting], index: MapIndex, config: Config) -> dict[int, Anchor]:
