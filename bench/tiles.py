@@ -14,6 +14,7 @@ from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3
 
 GAP_M = 20.0
+FLOAT_NOISE = 15.0  # of a tile's SIFT values: its copy of a point is as far as another view of it
 ASSOCIATED_PX = 10.0  # a query's feature so near a point's true projection, and alike, is of that point
 
 
@@ -77,6 +78,3 @@ class Tiles:
         noise = rng.normal(0, FLOAT_NOISE, (many, descriptors.shape[1]))
         value = descriptors + (noise if row is None else noise[row])
         return np.clip(np.rint(value), 0, 255).astype(np.uint8)
-
-
-FLOAT_NOISE = 15.0

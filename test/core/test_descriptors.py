@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from xalign_ros.core.descriptors import nearest, nearest_to_mean, pair_distance
+from xalign_ros.core.descriptors import indexed_distance, nearest, nearest_to_mean, pair_distance
 from xalign_ros.core.records import Norm
 
 every_norm = pytest.mark.parametrize("norm", list(Norm), ids=lambda n: n.name)
@@ -24,6 +24,17 @@ def brute(a, b, norm):
     if norm is Norm.COSINE_FLOAT32:
         return 1 - (x * y).sum(2) / np.linalg.norm(x, axis=2) / np.linalg.norm(y, axis=2)
     return np.sqrt(((x - y) ** 2).sum(2))
+
+
+@every_norm
+@pytest.mark.parametrize("pairs", [3, 5000], ids=["few", "many"])
+def test_indexed_distance_against_brute_force(norm, pairs):
+    """Pair by pair where they are few, through all of them where they are many."""
+    rng = np.random.default_rng(3)
+    a, b = some(norm, 40, rng), some(norm, 70, rng)
+    i, j = rng.integers(0, 40, pairs), rng.integers(0, 70, pairs)
+    np.testing.assert_allclose(indexed_distance(a, b, i, j, norm), brute(a, b, norm)[i, j], rtol=1e-3, atol=1e-3)
+    assert indexed_distance(a, b, i[:0], j[:0], norm).shape == (0,)
 
 
 @every_norm

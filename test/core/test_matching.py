@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import worlds
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from xalign_ros.core.config import Matching
 from xalign_ros.core.descriptors import pair_distance
-from xalign_ros.core.matching import guided_matches, place_matches, places
+from xalign_ros.core.lie import so3_exp
+from xalign_ros.core.matching import ELLIPSE_SIGMAS, _inside_ellipses, guided_matches, place_matches, places
 from xalign_ros.core.records import NO_TRACK, Features
 from xalign_ros.core.reference_map import MapIndex
 from xalign_ros.core.transforms import SE3
@@ -90,6 +93,43 @@ def test_nothing_in_view_is_no_match(world, index):
 def test_no_features_near_a_prediction_is_no_match(world, index):
     f = Features([[0.0, 0.0]], np.zeros((1, 32), np.uint8), "code")
     assert len(guided(world, index, world.truth[12], f)) <= 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 1000), features=st.integers(1, 60), points=st.integers(1, 40), size=st.floats(1, 90))
+def test_the_bands_find_what_looking_at_every_pair_finds(seed, features, points, size):
+    rng = np.random.default_rng(seed)
+    uv, centre = rng.uniform(-5, 645, (features, 2)), rng.uniform(-40, 680, (points, 2))
+    L = size * rng.normal(size=(points, 2, 2))
+    S = L @ np.swapaxes(L, 1, 2) + np.eye(2)
+    row, at = _inside_ellipses(uv, centre, S, 100.0)
+    longest = np.linalg.eigvalsh(S)[:, -1]
+    inverse = np.linalg.inv(S * np.minimum(ELLIPSE_SIGMAS**2, 100.0**2 / longest)[:, None, None])
+    d = uv[:, None] - centre
+    length = np.einsum("nmi,mij,nmj->nm", d, inverse, d)
+    clear = np.abs(length - 1) > 1e-6  # on the very edge rounding decides
+    found = np.zeros(length.shape, bool)
+    found[row, at] = True
+    assert len(row) == found.sum() and np.array_equal(found[clear], (length <= 1)[clear])
+
+
+def test_a_part_of_the_points_is_looked_for_where_there_are_many(world, index):
+    """Never more pairs than asked for, by much; and all points where they are few."""
+    T = world.truth[12]
+    features, _ = seen(world, T)
+    near = index.visible_points(T, index.keyframes_near(T, 20))
+    around = (features, worlds.CAMERA, index.map, near, T, np.diag([0.06] * 3 + [0.05] * 3) ** 2, 0.7, CONFIG)
+    all_, complete = guided_matches(*around)
+    some, part = guided_matches(*around, most_pairs=1000)
+    assert complete and not part and 0 < len(some) < len(all_) / 2
+
+
+def test_what_is_seen_from_the_other_side_or_from_afar_is_not_looked_for(world, index):
+    T = world.truth[12]
+    every = np.arange(len(world.map.keyframe_t))
+    assert len(index.visible_points(T, every)) > 100
+    behind = SE3(T.R @ so3_exp([0, np.pi, 0]), T.t + np.array([60.0, 60.0, 0]))
+    assert len(index.visible_points(behind, every)) == 0
 
 
 # The ratio test -----------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """The .xmap folder: what is written is read, to the bit; damage is a sentence; nothing half-written."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,9 @@ import worlds
 import yaml
 
 from xalign_ros.core.errors import MapError
-from xalign_ros.core.reference_map import ReferenceMap
+from xalign_ros.core.reference_map import MapIndex, ReferenceMap
 from xalign_ros.io import xmap
-from xalign_ros.io.xmap import ARRAYS, read_header, read_map, write_map
+from xalign_ros.io.xmap import ARRAYS, VISIBILITY, VOCABULARY, read_header, read_map, write_map
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,22 @@ def test_round_trip_is_exact(map_, folder) -> None:
     for a, b in zip(back.cameras, map_.cameras, strict=True):
         assert (a.model, a.width, a.height, *a.K, *a.D) == (b.model, b.width, b.height, *b.K, *b.D)
     np.testing.assert_array_equal(back.S_map_refmap.R, map_.S_map_refmap.R)
+
+
+def test_the_index_of_a_map_is_that_of_its_arrays(map_, folder) -> None:
+    back, made = read_map(folder, verify=True), MapIndex(map_)
+    for names, part in ((VISIBILITY, "visibility"), (VOCABULARY, "vocabulary")):
+        for name in names:
+            stored, fresh = getattr(getattr(back, part), name), getattr(getattr(made, part), name)
+            np.testing.assert_array_equal(stored, fresh, err_msg=name)
+    assert MapIndex(back).vocabulary is back.vocabulary  # nothing is learned again
+
+
+def test_an_index_of_other_arrays_is_refused(folder) -> None:
+    back = read_map(folder)
+    fewer = {name: getattr(back, name)[:-1] for name in ("points", "point_cov", "descriptors")}
+    with pytest.raises(ValueError, match="of another map"):
+        replace(back, **fewer)
 
 
 def test_same_map_same_version_other_map_other_version(map_, folder, tmp_path) -> None:
@@ -82,7 +99,7 @@ def test_failure_leaves_nothing(map_, tmp_path, monkeypatch) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ARRAYS)
+@pytest.mark.parametrize("name", [*ARRAYS, *VISIBILITY, *VOCABULARY])
 def test_a_flipped_bit_is_found_by_verify(folder, name) -> None:
     path = folder / f"{name}.npy"
     data = bytearray(path.read_bytes())

@@ -126,10 +126,10 @@ def sight(keyframe: Keyframe, index: MapIndex, config: Config) -> tuple[Anchor |
             matches, _ = search.around(index.visible_points(coarse, place), coarse)
             found = search.pose(matches, search.few, coarse)
         tried.append((matches, found))
-    poses = [(m, p) for m, p in tried if isinstance(p, Pose)]
+    sighting, poses = Sighting(keyframe, tuple(seen)), [(m, p) for m, p in tried if isinstance(p, Pose)]
     if not poses:
         most = max(tried, key=lambda t: len(t[0]), default=(NO_MATCHES, "too_few_matches"))
-        return _result(keyframe, index, *most, 0.0, search.few), Sighting(keyframe, tuple(seen))
+        return _result(keyframe, index, *most, 0.0, search.few), sighting
     distance = np.full((len(poses), len(keyframe.features)), np.inf)
     for row, (matches, pose) in zip(distance, poses, strict=True):
         row[matches.feature[pose.inlier]] = matches.distance[pose.inlier]
@@ -137,7 +137,7 @@ def sight(keyframe: Keyframe, index: MapIndex, config: Config) -> tuple[Anchor |
     first = int(support.argmax())
     others = [int(n) for n, hypothesis in zip(support, poses, strict=True) if _elsewhere(hypothesis, poses[first])]
     result = _result(keyframe, index, *poses[first], max(others, default=0) / int(support[first]), search.few)
-    return result, Sighting(keyframe, tuple(seen))
+    return result, sighting
 
 
 def find_together(sightings: Sequence[Sighting], index: MapIndex, config: Config) -> dict[int, Anchor]:

@@ -54,7 +54,7 @@ def guided_matches(
     x_cam = (map_.points[points] - T_map_cam.t) @ T_map_cam.R
     uv, valid, J = camera.project_with_jacobian(x_cam)
     seen = np.flatnonzero(valid & camera.inside(uv, config.guided_radius_px))
-    if not len(seen):
+    if not len(seen) or not len(features):
         return NO_MATCHES, True
     image = camera.width * camera.height
     some = seen[:: max(1, len(seen) // SAMPLED)]

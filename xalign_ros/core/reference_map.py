@@ -13,9 +13,7 @@ from xalign_ros.core.records import Norm
 from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.core.vocabulary import Vocabulary
 
-LEAST_VIEW_COSINE = (
-    0.5  # to the mean direction that a point was seen from (ORB-SLAM, Mur-Artal et al. 2015, section V-D)
-)
+LEAST_VIEW_COSINE = 0.5  # to the mean direction a point was seen from (ORB-SLAM, Mur-Artal et al. 2015, section V-D)
 MOST_ZOOM = 2.0  # times nearer or farther than a point was seen from
 
 

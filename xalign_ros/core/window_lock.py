@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import poselib
 
-from xalign_ros.core.camera import Camera
 from xalign_ros.core.config import Config
 from xalign_ros.core.lie import Array, hat
 from xalign_ros.core.odometry import pose_covariance
@@ -72,7 +71,7 @@ class _Window:
     ) -> None:
         self.keyframes, self.frame, self.config = keyframes, frame, config
         self.uv, self.xyz = np.concatenate([m.uv for m in matches]), np.concatenate([m.xyz for m in matches])
-        self.cameras = [_camera(k) for k in keyframes]
+        self.cameras = [k.camera for k in keyframes if k.camera is not None]
         rays = np.concatenate([c.unproject(m.uv)[0] for c, m in zip(self.cameras, matches, strict=True)])
         self.R = np.array([k.T_odom_cam.R for k in keyframes])
         self.t = np.array([k.T_odom_cam.t for k in keyframes])
@@ -174,8 +173,3 @@ class _Window:
             J[rows] = np.concatenate([J_cam @ hat(x_cam), -J_cam], axis=2) / sigma[:, None]
             size[rows] = np.linalg.norm(r[rows], axis=1)
         return r, J, A, size
-
-
-def _camera(keyframe: Keyframe) -> Camera:
-    assert keyframe.camera is not None
-    return keyframe.camera
