@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.core.vocabulary import Vocabulary
 
 LEAST_VIEW_COSINE = 0.5  # to the mean direction a point was seen from (ORB-SLAM, Mur-Artal et al. 2015, section V-D)
+MASK_COST = 20  # entries of a mask over all points that take the time of sorting one point
 MOST_ZOOM = 2.0  # times nearer or farther than a point was seen from
 
 
@@ -134,20 +136,31 @@ class ReferenceMap:
         return slice(int(self.feature_offset[k]), int(self.feature_offset[k + 1]))
 
 
+def _plain(record: Any) -> Any:
+    """The same memory-mapped arrays without their class, whose every slice and sum costs microseconds."""
+    mapped = {f.name: getattr(record, f.name) for f in fields(record)}
+    return replace(record, **{name: np.asarray(a) for name, a in mapped.items() if isinstance(a, np.memmap)})
+
+
 class MapIndex:
     """What a map's observations say of what sees what, and its vocabulary; learned here where the map brings none along."""
 
     def __init__(self, map_: ReferenceMap) -> None:
-        self.map = map_
-        self.visibility = map_.visibility or Visibility.of(map_)
+        self.map = map_ = _plain(map_)
+        self.visibility = _plain(map_.visibility or Visibility.of(map_))
         self._axis = np.ascontiguousarray(map_.keyframe_R[:, :, 2])
-        self.vocabulary = map_.vocabulary or Vocabulary.learn(map_.descriptors, map_.norm)
+        self.vocabulary = _plain(map_.vocabulary or Vocabulary.learn(map_.descriptors, map_.norm))
 
     def points_of(self, keyframes: np.ndarray) -> np.ndarray:
         """Sorted indices of the points seen by any of these map keyframes."""
         v = self.visibility
         parts = [v.keyframe_point[v.keyframe_offset[k] : v.keyframe_offset[k + 1]] for k in keyframes]
-        return np.unique(np.concatenate(parts)).astype(np.int64) if parts else np.zeros(0, np.int64)
+        points = np.concatenate(parts) if parts else np.zeros(0, np.int64)
+        if len(points) * MASK_COST < len(self.map.points):
+            return np.unique(points).astype(np.int64)
+        seen = np.zeros(len(self.map.points), bool)
+        seen[points] = True
+        return np.flatnonzero(seen)
 
     def visible_points(self, T_map_cam: SE3, keyframes: np.ndarray) -> np.ndarray:
         """Points that any of these map keyframes sees and this camera might: from about that side, about as far away."""
