@@ -52,7 +52,9 @@ setup(
             "gtsam==4.3.0",
             "qdldl==0.1.9.post1",
             "poselib==2.0.5",
-            "opencv-python-headless==5.0.0.93",
+            "opencv-contrib-python-headless==5.0.0.93",  # AKAZE has moved there
+            "h5py>=3.11,<4",
+            "rich>=13.7,<16",
             "mcap>=1.3,<2",
             "zstandard>=0.22,<1",
             "rosbags==0.11.9",

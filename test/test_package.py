@@ -233,14 +233,15 @@ def test_commands():
 
 
 # Import name -> name in package.xml and of the pip distribution, where they differ. None: rosdep has no key.
-ROSDEP = {name: None for name in ("gtsam", "poselib", "qdldl", "mcap", "zstandard", "rosbags")} | {
+ROSDEP = {name: None for name in ("gtsam", "poselib", "qdldl", "mcap", "zstandard", "rosbags", "rich")} | {
     "cv2": "python3-opencv",
+    "h5py": "python3-h5py",
     "matplotlib": "python3-matplotlib",
     "numpy": "python3-numpy",
     "scipy": "python3-scipy",
     "yaml": "python3-yaml",
 }
-DISTRIBUTION = {"cv2": "opencv-python-headless", "yaml": "pyyaml"}
+DISTRIBUTION = {"cv2": "opencv-contrib-python-headless", "yaml": "pyyaml"}
 
 
 def imports(paths):

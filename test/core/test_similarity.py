@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from xalign_ros.core.lie import so3_log
-from xalign_ros.core.similarity import fit_similarity
+from xalign_ros.core.similarity import fit_similarity, fit_similarity_robust
 from xalign_ros.core.transforms import Sim3
 
 seeds = st.integers(0, 2**32 - 1)
@@ -130,3 +130,31 @@ def test_far_from_the_origin_is_no_worse() -> None:
 def test_what_fixes_no_similarity_is_refused(x: object, y: object, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         fit_similarity(np.array(x, float), np.array(y, float))
+
+
+@few
+@given(seeds)
+def test_robust_fit_is_that_of_the_points_that_are_right(seed: int) -> None:
+    """With four in ten points anywhere, noise in a plane or in space: within the spread that the good ones leave."""
+    rng = np.random.default_rng(seed)
+    S, x = a_similarity(rng), points(rng, int(rng.integers(2, 4)), 40)
+    noise = rng.normal(0, 0.02, (40, 3))
+    y = S.apply(x + noise)
+    wrong = rng.permutation(40)[:16]
+    y[wrong] += S.s * rng.normal(0, 30, (16, 3))
+    found, gap, sigma = fit_similarity_robust(x, y)
+    assert sigma == pytest.approx(0.02 * S.s, rel=0.6)
+    assert np.linalg.norm((S.inverse() @ found).apply(x) - x, axis=1).max() < 0.1
+    far = np.linalg.norm(y[wrong] - S.apply(x[wrong]), axis=1) > 10 * sigma
+    assert (gap[wrong][far] > 5 * sigma).all() and np.median(gap) < 4 * sigma
+
+
+def test_robust_fit_refuses_a_line_and_takes_three_points() -> None:
+    rng = np.random.default_rng(0)
+    S, line = a_similarity(rng), np.outer(np.arange(20.0), [1, 2, 3])
+    for noise in (0.0, 0.05):
+        with pytest.raises(ValueError, match="on a line"):
+            fit_similarity_robust(line, S.apply(line + rng.normal(0, noise, line.shape)))
+    found, gap, _ = fit_similarity_robust(np.eye(3), S.apply(np.eye(3)))
+    np.testing.assert_allclose(found.s, S.s, rtol=1e-9)
+    assert gap.max() < 1e-9 * S.s * np.abs(S.t).max()

@@ -12,6 +12,7 @@ from xalign_ros.core.descriptors import nearest_to_mean, pair_distance
 from xalign_ros.core.lie import Array
 from xalign_ros.core.map_refinement import Bearings, refine_poses
 from xalign_ros.core.pnp import Points2D3D, Pose, refine_pose
+from xalign_ros.core.progress import Progress, unseen
 from xalign_ros.core.records import NO_TRACK, Keyframe, Norm
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.tracks import matched_tracks, seen_twice
@@ -53,7 +54,14 @@ def _camera(keyframe: Keyframe) -> Camera:
 
 
 def build_map(
-    keyframes: Sequence[Keyframe], poses: Sequence[SE3], *, map_id: str, source: str, frame: str = "map", metric: bool
+    keyframes: Sequence[Keyframe],
+    poses: Sequence[SE3],
+    *,
+    map_id: str,
+    source: str,
+    frame: str = "map",
+    metric: bool,
+    progress: Progress = unseen,
 ) -> ReferenceMap:
     """The map of posed keyframes (poses are T_map_cam), by track id where every feature set has ids, else by matching.
 
@@ -67,7 +75,7 @@ def build_map(
     features = [k.features for k in keyframes]
     each = [_camera(k) for k in keyframes]
     obs = Observations(each, [f.uv for f in features], [f.descriptors for f in features], poses)
-    track = _track_ids(keyframes, obs) if _have_tracks(keyframes) else matched_tracks(keyframes, poses)
+    track = _track_ids(keyframes, obs) if _have_tracks(keyframes) else matched_tracks(keyframes, poses, progress)
     cameras, which = _distinct_cameras(each)
     used = np.flatnonzero((track >= 0) & obs.valid)
     track_index, compact = np.unique(track[used], return_inverse=True)

@@ -9,6 +9,7 @@ import numpy as np
 from xalign_ros.core.anchor import find_anywhere
 from xalign_ros.core.config import Config
 from xalign_ros.core.descriptors import nearest_to_mean
+from xalign_ros.core.progress import Progress, unseen
 from xalign_ros.core.records import Anchor, Features, Keyframe
 from xalign_ros.core.reference_map import MapIndex, ReferenceMap
 from xalign_ros.core.triangulation import triangulate
@@ -16,7 +17,9 @@ from xalign_ros.core.triangulation import triangulate
 FOLDS = 5
 
 
-def check_map(map_: ReferenceMap, config: Config | None = None) -> dict[str, float | int | None]:
+def check_map(
+    map_: ReferenceMap, config: Config | None = None, progress: Progress = unseen
+) -> dict[str, float | int | None]:
     """Localize every keyframe by its features alone in a map triangulated anew without it and its fold of a fifth.
 
     Returns counts, recall, errors against the keyframes' own poses (m, deg) and the mean NEES of 6 degrees of freedom.
@@ -24,7 +27,7 @@ def check_map(map_: ReferenceMap, config: Config | None = None) -> dict[str, flo
     config = config or Config()
     total = len(map_.keyframe_t)
     rows = []
-    for fold in range(min(FOLDS, total)):
+    for fold in progress(range(min(FOLDS, total)), "localizing keyframes that are held out"):
         held = np.arange(total) % FOLDS == fold
         index = MapIndex(without_keyframes(map_, held))
         for k in np.flatnonzero(held):

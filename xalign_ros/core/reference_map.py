@@ -75,7 +75,9 @@ class ReferenceMap:
     T_map_cam; features of keyframe k are rows feature_offset[k]:feature_offset[k+1] of feature_uv (F, 2) px,
     feature_descriptors (F, B) and feature_point (F,), -1 = none. sigma_px is the robust reprojection residual of the
     map's own observations; anchor_sigma = (rad, m) what a held-out keyframe's anchor errs beyond its covariance;
-    descriptor_gate the distance below which two descriptors may be of one point. visibility and vocabulary are of these
+    descriptor_gate the distance below which two descriptors may be of one point. S_map_refmap leads from the frame that
+    the map's source had; georeference is latitude, longitude (deg) and height (m, WGS84) of the map's origin, whose axes
+    are then east, north, up. visibility and vocabulary are of these
     very arrays: None where the arrays are changed. Raises ValueError on wrong shapes.
     """
 
@@ -101,6 +103,7 @@ class ReferenceMap:
     descriptor_gate: float
     anchor_sigma: tuple[float, float] = (0.0, 0.0)
     S_map_refmap: Sim3 = field(default_factory=Sim3.identity)
+    georeference: tuple[float, float, float] | None = None
     visibility: Visibility | None = None
     vocabulary: Vocabulary | None = None
 

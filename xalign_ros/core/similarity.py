@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -9,6 +12,8 @@ from xalign_ros.core.lie import Array, project_rotation, so3_exp
 from xalign_ros.core.transforms import Sim3
 
 COINCIDENT = 1e-12  # spread of points that are one point, as a part of their distance from the origin
+TRIPLES = 300  # of which one is free of outliers up to half of them, but for one chance in 10^17
+TRIMMED_SIGMAS = 3.0
 COLLINEAR = 1e-12  # second over first singular value of the cross-covariance of points on one line
 
 
@@ -33,6 +38,39 @@ def fit_similarity(x: ArrayLike, y: ArrayLike) -> Sim3:
         raise ValueError("the two sets of points are not similar in any way")
     s = ratio * y_spread / x_spread
     return Sim3(R, y0 - s * (R @ x0), s)
+
+
+def fit_similarity_robust(x: ArrayLike, y: ArrayLike, seed: int = 0) -> tuple[Sim3, Array, float]:
+    """S_y_x of corresponding points (N, 3) of which fewer than half are wrong, the gaps (N,) and their sigma per axis.
+
+    Of the similarities of random triples, the one with the least median gap; then fits to what lies within
+    TRIMMED_SIGMAS of it (least median of squares with reweighting, Rousseeuw and Leroy 1987, chapter 5). Raises
+    ValueError as fit_similarity, and where the points lie on a line within that sigma: the turn about it is open.
+    """
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    best, least = fit_similarity(x, y), np.inf
+    for candidate in (best, *_from_triples(x, y, seed)):
+        middle = float(np.median(np.linalg.norm(candidate.apply(x) - y, axis=1)))
+        if middle < least:
+            best, least = candidate, middle
+    kept = np.ones(len(x), bool)
+    for _ in range(10):
+        gap = np.linalg.norm(best.apply(x) - y, axis=1)
+        sigma = float(np.median(gap[kept])) / 1.538  # the median length of three unit normals
+        kept = gap <= TRIMMED_SIGMAS * np.sqrt(3) * sigma + 1e-9 * float(np.abs(y).max())
+        best = fit_similarity(x[kept], y[kept])
+    across = np.linalg.svd(y[kept] - y[kept].mean(axis=0), compute_uv=False)[1] / np.sqrt(kept.sum())
+    if not across > max(TRIMMED_SIGMAS * sigma, COLLINEAR * float(np.abs(y).max())):
+        raise ValueError("the points lie on a line, which leaves the turn about it open")
+    return best, np.linalg.norm(best.apply(x) - y, axis=1), sigma
+
+
+def _from_triples(x: Array, y: Array, seed: int) -> Iterator[Sim3]:
+    rng = np.random.default_rng(seed)
+    for _ in range(TRIPLES):
+        three = rng.choice(len(x), 3, replace=False)
+        with suppress(ValueError):  # of three that coincide
+            yield fit_similarity(x[three], y[three])
 
 
 def _centred(x: Array, which: str) -> tuple[Array, float]:

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from xalign_ros.core.descriptors import nearest
 from xalign_ros.core.lie import Array
+from xalign_ros.core.progress import Progress, unseen
 from xalign_ros.core.records import Keyframe
 from xalign_ros.core.transforms import SE3
 
@@ -20,14 +21,14 @@ MAX_VIEW_RAD = np.deg2rad(60.0)
 EPIPOLAR_PX = 8.0  # at twice the keypoint noise this still leaves room for a degree of pose error
 
 
-def matched_tracks(keyframes: Sequence[Keyframe], poses: Sequence[SE3]) -> np.ndarray:
+def matched_tracks(keyframes: Sequence[Keyframe], poses: Sequence[SE3], progress: Progress = unseen) -> np.ndarray:
     """Track (F,) of every feature of all keyframes in order, -1 = none; no track has two features of one keyframe."""
     sizes = [len(k.features) for k in keyframes]
     offset = np.r_[0, np.cumsum(sizes)]
     rays = [_rays(k) for k in keyframes]
     links = [
         offset[[a, b]][:, None] + _pair(keyframes[a], keyframes[b], rays[a], rays[b], poses[a].inverse() @ poses[b])
-        for a, b in _pairs(poses)
+        for a, b in progress(_pairs(poses), "matching keyframes")
     ]
     link = np.concatenate(links, axis=1) if links else np.zeros((2, 0), np.int64)
     graph = coo_array((np.ones(link.shape[1], bool), (link[0], link[1])), shape=(offset[-1], offset[-1]))

@@ -5,6 +5,7 @@ The reconstruction's frame is COLMAP's world and its unit COLMAP's, which is no 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,23 +51,52 @@ def read_colmap_reconstruction(model_dir: Path, database: Path, descriptor: str 
     `descriptor` names float descriptors where the database does not. Raises MapError where either cannot be read, the
     model is empty or of a camera model that xalign has not, or its keypoints are not the database's row by row.
     """
+    model, images = model_images(model_dir)
+    features = read_database(database, [image.name for image in images])
+    for image in images:
+        _check_same_keypoints(database, image, features[image.name][0])
+    name, norm = _descriptor(database, features, descriptor)
+    return posed_reconstruction(model_dir, model, images, [features[image.name] for image in images], name, norm)
+
+
+def model_images(model_dir: Path) -> tuple[ColmapModel, list[ColmapImage]]:
+    """The model in (or below) a folder, and its images by name. Raises MapError where it has no images or points."""
     model = read_model(model_dir)
     images = sorted(model.images.values(), key=lambda image: image.name)
     if not images or not len(model.points.ids):
         what = "points" if images else "images"
         raise MapError(f"{model_dir}: the model has no {what}; give the folder of a finished reconstruction.")
-    features = read_database(database, [image.name for image in images])
-    for image in images:
-        _check_same_keypoints(database, image, features[image.name][0])
-    name, norm = _descriptor(database, features, descriptor)
+    return model, images
+
+
+def model_cameras(model_dir: Path) -> tuple[list[str], list[Camera], list[SE3]]:
+    """Names of a model's images, in order, with camera and T_map_cam. Raises MapError."""
+    model, images = model_images(model_dir)
+    cameras = {k: _camera(model_dir, model.cameras[k]) for k in sorted({image.camera_id for image in images})}
+    poses = [SE3(image.R_cam_map, image.t_cam_map).inverse() for image in images]
+    return [image.name for image in images], [cameras[image.camera_id] for image in images], poses
+
+
+def posed_reconstruction(
+    model_dir: Path,
+    model: ColmapModel,
+    images: Sequence[ColmapImage],
+    features: Sequence[tuple[Array, NDArray[Any]]],
+    name: str,
+    norm: Norm,
+) -> PosedReconstruction:
+    """The model's images with their features, uv (N, 2) px and descriptors (N, B), in the rows of its keypoints.
+
+    Raises MapError where a camera is of a model that xalign has not.
+    """
     used = sorted({image.camera_id for image in images})
     return PosedReconstruction(
         cameras=tuple(_camera(model_dir, model.cameras[k]) for k in used),
         keyframe_camera=np.array([used.index(image.camera_id) for image in images]),
         names=tuple(image.name for image in images),
         T_map_cam=tuple(SE3(image.R_cam_map, image.t_cam_map).inverse() for image in images),
-        uv=tuple(features[image.name][0] for image in images),
-        descriptors=tuple(features[image.name][1] for image in images),
+        uv=tuple(uv for uv, _ in features),
+        descriptors=tuple(descriptors for _, descriptors in features),
         point=_point_rows(model, images),
         points=model.points.xyz,
         descriptor_name=name,
@@ -127,7 +157,7 @@ def _descriptor(path: Path, features: dict[str, tuple[Array, NDArray[Any]]], nam
     return "sift", Norm.L2_UINT8
 
 
-def _point_rows(model: ColmapModel, images: list[ColmapImage]) -> tuple[Ints, ...]:
+def _point_rows(model: ColmapModel, images: Sequence[ColmapImage]) -> tuple[Ints, ...]:
     """Row of model.points (N,) that each image's keypoints see, -1 = none."""
     order = np.argsort(model.points.ids)
     ids = model.points.ids[order]

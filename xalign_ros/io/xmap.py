@@ -49,6 +49,8 @@ VOCABULARY: dict[str, str | None] = {
     "code": None,
 }  # of code: by its width
 
+GEOREFERENCE = ("latitude_deg", "longitude_deg", "height_m")
+
 
 def write_map(map_: ReferenceMap, folder: Path, *, force: bool = False) -> str:
     """Write a map; returns its version, from the arrays' checksums. Raises MapError where `folder` exists, unless forced."""
@@ -98,6 +100,7 @@ def _header(map_: ReferenceMap, version: str, arrays: dict[str, Any]) -> dict[st
         "sigma_px": float(map_.sigma_px),
         "anchor_sigma": {"rotation_rad": float(map_.anchor_sigma[0]), "translation_m": float(map_.anchor_sigma[1])},
         "T_map_refmap": {"rotation": S.R.tolist(), "translation": S.t.tolist(), "scale": S.s},
+        "georeference": dict(zip(GEOREFERENCE, map_.georeference, strict=True)) if map_.georeference else None,
         "cameras": [
             {"model": c.model, "K": c.K.tolist(), "D": c.D.tolist(), "width": c.width, "height": c.height}
             for c in map_.cameras
@@ -132,12 +135,20 @@ def read_map(folder: Path, *, verify: bool = False) -> ReferenceMap:
             sigma_px=float(header["sigma_px"]),
             anchor_sigma=(float(a["rotation_rad"]), float(a["translation_m"])),
             S_map_refmap=Sim3(np.array(S["rotation"]), np.array(S["translation"]), S["scale"]),
+            georeference=_origin(header.get("georeference")),
             **arrays,
             visibility=Visibility(**seen),
             vocabulary=Vocabulary(**words),
         )
     except (KeyError, TypeError, ValueError) as e:
         raise MapError(f"{folder / 'map.yaml'} does not describe a map ({e!r}); build the map anew") from None
+
+
+def _origin(earth: dict[str, float] | None) -> tuple[float, float, float] | None:
+    if earth is None:
+        return None
+    latitude, longitude, height = (float(earth[name]) for name in GEOREFERENCE)
+    return latitude, longitude, height
 
 
 def read_header(folder: Path) -> dict[str, Any]:
