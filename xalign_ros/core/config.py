@@ -53,7 +53,7 @@ class Pnp:
         12, "1", "fewest matches that agree within a place of the whole map; chance gives up to 8", 6, 10000
     )
     min_spread: float = option(
-        4.0, "1", "matches within two sigma, times the part of the image they cover, at least", 0.0, 10000.0
+        2.5, "1", "sharp matches within two sigma, times the part of the image they cover, at least", 0.0, 10000.0
     )
     sigma_px: float = option(1.0, "px", "keypoint noise where the features do not give their own", 0.05, 20.0)
     threshold_sigmas: float = option(4.0, "1", "inlier threshold in standard deviations of a match", 1.0, 20.0)

@@ -20,7 +20,8 @@ MAX_RAY_RAD = np.deg2rad(80.0)  # of a virtual pinhole
 CLEAR_MAJORITY, CLEAR_INLIERS = 0.9, 60  # part of the matches, and their number
 SWEEPS = 10  # at most
 FAR = 5.0  # times the inlier threshold; no sweep brings such a match back
-CAUCHY = 3.0  # standard deviations
+TUKEY = 1.5  # times the inlier threshold, beyond which a match has no weight
+WIDE = 3.0  # scale of the first sweep: from below, a scale and its inliers may hold each other down
 LEAST_SCALE = 0.3  # of the residuals' scale over what the features say of themselves
 CONVERGED = 0.03  # length of a step in standard deviations of the pose
 
@@ -77,7 +78,7 @@ def sample_pose(m: Points2D3D, camera: Camera, seed: int, config: Pnp) -> SE3 | 
         m.xyz[usable],
         {"model": "PINHOLE", "width": size, "height": size, "params": [focal, focal, 0.0, 0.0]},
         {
-            "max_reproj_error": config.threshold_sigmas * float(np.median(m.sigma_px)),
+            "max_reproj_error": TUKEY * config.threshold_sigmas * float(np.median(m.sigma_px)),
             "seed": seed,
             "max_iterations": config.iterations,
             "min_iterations": 50,
@@ -91,43 +92,48 @@ def sample_pose(m: Points2D3D, camera: Camera, seed: int, config: Pnp) -> SE3 | 
 
 
 def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> Pose | str:
-    """Iteratively reweighted least squares in pixels under Cauchy's loss, cut off at the inlier threshold.
+    """Iteratively reweighted least squares in pixels under Tukey's loss, which is flat from TUKEY thresholds on.
 
     A residual's covariance is sigma_px^2 I + J R^T cov R J^T, the map point's own uncertainty is in it, times a scale
     that the residuals tell: the median length of two Gaussian components is 1.1774 sigma (Rayleigh). The covariance is
-    that of an M-estimator, A/B^2 (J^T J)^-1 with the means A of psi^2 and B of psi' over the inliers (Huber and Ronchetti,
-    Robust Statistics, 2009, section 7.6), so that it holds for tails heavier than Gaussian ones, too; `few` is their
-    correction for few residuals, and what an estimated scale adds to the mean NEES.
+    that of an M-estimator, A/B^2 (J^T J)^-1 with the means A of psi^2 and B of psi' over the matches (Huber and Ronchetti,
+    Robust Statistics, 2009, section 7.6), so that it holds for tails heavier than Gaussian ones, too; psi must not jump
+    for that, as one that is cut off does. `few` is their correction for few residuals, which count by their weights, and
+    what an estimated scale adds to the mean NEES.
     """
-    gate, scale, count = config.threshold_sigmas, 1.0, len(m.uv)
+    flat, scale, count = TUKEY * config.threshold_sigmas, WIDE, len(m.uv)
     r, J, size, error_px, W = _residuals(T_map_cam, m, camera, None)
-    near = np.flatnonzero(size < FAR * gate)
+    near = np.flatnonzero(size < FAR * config.threshold_sigmas)
     m, W = m.take(near), W[near]
     r, J, size, error_px = r[near], J[near], size[near], error_px[near]
     for sweep in range(SWEEPS):
-        inlier = np.flatnonzero(size < gate * scale)
-        if len(inlier) < config.min_inliers:
+        used = np.flatnonzero(size < flat * scale)
+        if len(used) < config.min_inliers:
             return "too_few_inliers"
-        scale = max(_median(size[inlier]) / 1.1774, LEAST_SCALE)
-        u2 = (size[inlier] / scale) ** 2
-        weight = 1 / (1 + u2 / CAUCHY**2)
-        Ji, ri = J[inlier].reshape(-1, 6), r[inlier].ravel()
-        weighted = Ji * np.repeat(weight, 2)[:, None]
-        H, g = weighted.T @ Ji, weighted.T @ ri
+        scale = max(_median(size[used]) / 1.1774, LEAST_SCALE)
+        u2 = (size[used] / scale) ** 2
+        part = np.maximum(1 - u2 / flat**2, 0)
+        weight = part**2
+        Ju, ru = J[used].reshape(-1, 6), r[used].ravel()
+        weighted = Ju * np.repeat(weight, 2)[:, None]
+        H, g = weighted.T @ Ju, weighted.T @ ru
         step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -g)
         if sweep and -step @ g < (CONVERGED * scale) ** 2:
             break
-        depth = _median((m.xyz[inlier] - T_map_cam.t) @ T_map_cam.R[:, 2])
+        depth = _median((m.xyz[used] - T_map_cam.t) @ T_map_cam.R[:, 2])
         if step[3:] @ step[3:] > (config.max_sigma_ratio * depth) ** 2:
             return "degenerate"
         T_map_cam = T_map_cam @ SE3(so3_exp(step[:3]), step[3:])
         r, J, size, error_px, W = _residuals(T_map_cam, m, camera, W)
-    H = Ji.T @ Ji
+    inlier = np.flatnonzero(size < config.threshold_sigmas * scale)
+    if len(inlier) < config.min_inliers:
+        return "too_few_inliers"
+    H = Ju.T @ Ju
     eigen = np.linalg.eigvalsh(H)
     if eigen[0] <= 1e-12 * eigen[-1]:
         return "degenerate"
-    A, curvature = float((weight**2 * u2).mean()) / 2, weight - weight**2 * u2 / CAUCHY**2
-    B, numbers = float(curvature.mean()), 2 * len(u2)
+    A, curvature = float((weight**2 * u2).mean()) / 2, weight - 2 * part * u2 / flat**2
+    B, numbers = float(curvature.mean()), 2 * float(weight.sum())
     few = numbers / (numbers - 8) * (1 + 6 / numbers * float(curvature.var()) / B**2) ** 2
     spread = A / B**2 if scale > LEAST_SCALE else max(A / B**2, 1.0)
     cov = np.linalg.inv(H) * scale**2 * spread * few * config.inflation
@@ -136,21 +142,24 @@ def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> P
         return "high_residual"
     if np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]) > config.max_sigma_ratio * depth:
         return "degenerate"
-    if evidence(m.uv[size < 2], camera) < config.min_spread:
+    sharp = m.sigma_px**2 * W[:, 0, 0] * W[:, 1, 1]
+    if evidence(m.uv[size < 2], camera, sharp[size < 2]) < config.min_spread:
         return "degenerate" if evidence(m.uv[inlier], camera) < config.min_spread else "high_residual"
     is_inlier = np.zeros(count, bool)
     is_inlier[near[inlier]] = True
     return Pose(T_map_cam, (cov + cov.T) / 2, is_inlier, float(np.sqrt((error_px[inlier] ** 2).mean())), rms_sigmas)
 
 
-def evidence(uv: Array, camera: Camera) -> float:
+def evidence(uv: Array, camera: Camera, sharp: Array | None = None) -> float:
     """Number of matches (N, 2) px, times the part of the image that a uniform distribution of their covariance covers.
 
     Matches in a corner may agree on a pose by a pattern that repeats, and a right one leans on their errors; as many over
-    the image do neither.
+    the image do neither. `sharp` (N,) are the keypoints' areas of uncertainty over those of the residuals: a point that
+    may lie anywhere agrees with any pose, so a match counts for that part only.
     """
     area = 12 * np.sqrt(max(float(np.linalg.det(np.cov(uv.T))), 0.0)) if len(uv) > 2 else 0.0
-    return len(uv) * area / (camera.width * camera.height)
+    number = len(uv) if sharp is None else float(sharp.sum())
+    return number * area / (camera.width * camera.height)
 
 
 def _median(x: Array) -> float:
