@@ -184,10 +184,12 @@ def test_track_ids_of_two_sessions_are_not_mixed():
     seen = np.flatnonzero(separate.feature_point >= 0)
     off = np.linalg.norm(separate.points[separate.feature_point[seen]] - truth[ids[seen]], axis=1)
     assert np.median(off) < 0.1 and (off < 1).mean() > 0.97
-    # No point has observations of both sessions.
+    # A point of both sessions is one landmark, found again by where and what it is.
     session = np.repeat([0] * 8 + [1] * 8, np.diff(separate.feature_offset))[seen]
-    pairs = np.unique(np.stack([separate.feature_point[seen], session]), axis=1)
-    assert len(pairs[0]) == len(separate.points)
+    point = separate.feature_point[seen]
+    both = np.intersect1d(point[session == 0], point[session == 1])
+    most = [np.bincount(ids[seen][point == p]).max() / np.sum(point == p) for p in both]
+    assert len(both) > 50 and np.mean(most) > 0.98
 
 
 def test_one_id_twice_in_a_keyframe_is_believed_of_neither():

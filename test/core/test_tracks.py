@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import worlds
 
-from xalign_ros.core.records import Features, Keyframe
-from xalign_ros.core.tracks import _epipolar_rad, matched_tracks, seen_twice
+from xalign_ros.core.records import Features, Keyframe, Norm
+from xalign_ros.core.tracks import _epipolar_rad, matched_tracks, merged_tracks, seen_twice
 from xalign_ros.core.transforms import SE3
+from xalign_ros.core.triangulation import triangulate
 
 
 def posed_run(count=8, seed=0, alike=False):
@@ -108,3 +109,29 @@ def test_epipolar_angle_by_hand():
     # Without a baseline the rays themselves must agree.
     still = _epipolar_rad(np.array([[0, 0, 1.0]]), np.array([[0, np.sin(0.02), np.cos(0.02)]]), SE3.identity())
     assert abs(still[0] - 0.02) < 1e-6
+
+
+def test_what_a_tracker_found_again_is_one_track():
+    """Landmarks under a new track id in the second half of a run; look-alikes beside each other stay two."""
+    rng = np.random.default_rng(8)
+    points, codes = worlds.scattered(rng, [2, -5, -2], [12, 8, 3], 300), worlds.coded(rng, 300)
+    points[150:], codes[150:] = points[:150] + np.array([0, 0, 0.05]), codes[:150]  # seen together, so never one
+    poses = worlds.along_line(10, 0.5)
+    centre, ray, track, frame, code = [], [], [], [], []
+    for n, T in enumerate(poses):
+        d = points - T.t
+        centre.append(np.repeat(T.t[None], 300, axis=0))
+        noisy = d / np.linalg.norm(d, axis=1, keepdims=True) + rng.normal(0, 5e-4, d.shape)
+        ray.append(noisy / np.linalg.norm(noisy, axis=1, keepdims=True))
+        track.append(np.arange(300) + 300 * (n >= 5))
+        frame.append(np.full(300, n))
+        code.append(worlds.flipped(codes, rng, 0.05))
+    centre, ray, track, frame, code = (np.concatenate(x) for x in (centre, ray, track, frame, code))
+    found = triangulate(track, 600, centre, ray, np.full(len(track), 7e-4))
+    merged = merged_tracks(found, track, frame, code, Norm.HAMMING)
+    both = np.flatnonzero(found.kept[:300] & found.kept[300:])
+    first = {t: merged[track == t][0] for t in range(600)}
+    again = np.array([first[t] == first[t + 300] for t in both])
+    assert len(both) > 150 and again.mean() > 0.8
+    twins = [t for t in range(150) if found.kept[t] and found.kept[t + 150]]
+    assert np.mean([first[t] == first[t + 150] for t in twins]) < 0.05

@@ -15,7 +15,7 @@ from xalign_ros.core.pnp import Points2D3D, Pose, refine_pose
 from xalign_ros.core.progress import Progress, unseen
 from xalign_ros.core.records import NO_TRACK, Keyframe, Norm
 from xalign_ros.core.reference_map import ReferenceMap
-from xalign_ros.core.tracks import matched_tracks, seen_twice
+from xalign_ros.core.tracks import matched_tracks, merged_tracks, seen_twice
 from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.core.triangulation import Triangulated, triangulate
 
@@ -80,6 +80,12 @@ def build_map(
     used = np.flatnonzero((track >= 0) & obs.valid)
     track_index, compact = np.unique(track[used], return_inverse=True)
     points, sigma_px = _triangulate_twice(obs, used, compact, len(track_index))
+    if points.kept.any() and _have_tracks(keyframes):
+        compact = merged_tracks(points, compact, obs.frame[used], obs.descriptors[used], norm)
+        compact[seen_twice(compact, obs.frame[used])] = -1
+        used, compact = used[compact >= 0], compact[compact >= 0]
+        track_index, compact = np.unique(compact, return_inverse=True)
+        points, sigma_px = _triangulate_twice(obs, used, compact, len(track_index))
     jitter_px = np.sqrt(max(sigma_px**2 - KEYPOINT_SIGMA_PX**2, 0.0))
     if points.kept.any() and jitter_px > 0:
         bearings = _bearings(obs, used, compact, points, sigma_px)
@@ -200,8 +206,8 @@ def _anchor_sigma(
 
     Every fifth keyframe is held out in turn, the rest is triangulated anew, and the held-out keyframe's pose from its
     own tracks is compared with the pose it was given. Per axis, robust: 1.4826 medians, whose squares have a relative
-    standard error of 2.33 / sqrt(n) (Rousseeuw and Croux 1993); that much is taken off, since what chance adds to the
-    excess stays while what it takes away is cut off at zero.
+    standard error of 2.33 / sqrt(n) (Rousseeuw and Croux 1993). Where nothing is in excess, half of the chance outcomes are
+    cut off at zero and the mean of the others is 0.4 of that: so much is taken off.
     """
     count = int(track.max()) + 1
     error, own = [], []
@@ -223,7 +229,7 @@ def _anchor_sigma(
         return 0.0, 0.0
     spread = (1.4826 * np.median(np.abs(error), axis=0)) ** 2
     excess = spread - np.median(own, axis=0)
-    chance = 2.33 / np.sqrt(3 * len(error))
+    chance = 0.4 * 2.33 / np.sqrt(3 * len(error))
     parts = [excess[axes].mean() - chance * spread[axes].mean() for axes in (slice(0, 3), slice(3, 6))]
     rotation, translation = np.sqrt(np.maximum(parts, 0))
     return float(rotation), float(translation)

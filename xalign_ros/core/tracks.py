@@ -7,17 +7,21 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from xalign_ros.core.descriptors import nearest
+from xalign_ros.core.descriptors import nearest, nearest_to_mean, pair_distance
 from xalign_ros.core.lie import Array
 from xalign_ros.core.progress import Progress, unseen
-from xalign_ros.core.records import Keyframe
+from xalign_ros.core.records import Keyframe, Norm
 from xalign_ros.core.transforms import SE3
+from xalign_ros.core.triangulation import Triangulated
 
 RATIO = 0.85
 SEQUENTIAL = 4  # following keyframes that every keyframe is matched with
 SPATIAL = 8  # nearest keyframes that look the same way
 MAX_VIEW_RAD = np.deg2rad(60.0)
+NEIGHBOURS = 8  # of a point, that may be the same
+CHI2_99 = 11.34  # of three degrees of freedom
 EPIPOLAR_PX = 8.0  # at twice the keypoint noise this still leaves room for a degree of pose error
 
 
@@ -38,6 +42,36 @@ def matched_tracks(keyframes: Sequence[Keyframe], poses: Sequence[SE3], progress
     track = np.where(linked, track, -1)
     track[seen_twice(track, np.repeat(np.arange(len(sizes)), sizes))] = -1
     return track
+
+
+def merged_tracks(
+    points: Triangulated, track: np.ndarray, frame: np.ndarray, descriptors: np.ndarray, norm: Norm
+) -> np.ndarray:
+    """Track (O,) of the observations where tracks of one point are one: a tracker loses things and finds them again.
+
+    Two tracks are merged where their points lie within the uncertainty of both, no keyframe sees both, and a descriptor
+    of one is as near to one of the other's as half of the descriptors within tracks are to each other.
+    """
+    row, kept = np.flatnonzero(points.inlier), np.flatnonzero(points.kept)
+    count = len(kept)
+    own = np.searchsorted(kept, track[row])
+    best = row[nearest_to_mean(descriptors[row], own, count, norm)]
+    within = pair_distance(descriptors[row], descriptors[best[own]], norm)[row != best[own]]
+    xyz, cov = points.xyz[kept], points.cov[kept]
+    near = cKDTree(xyz).query(xyz, k=min(NEIGHBOURS, count))[1].reshape(count, -1)
+    a, b = np.repeat(np.arange(count), near.shape[1]), near.ravel()
+    a, b = a[a < b], b[a < b]
+    gap = (xyz[a] - xyz[b])[:, :, None]
+    close = (np.swapaxes(gap, 1, 2) @ np.linalg.solve(cov[a] + cov[b], gap)).ravel() < CHI2_99
+    alike = pair_distance(descriptors[best[a]], descriptors[best[b]], norm) <= np.median(within)
+    seen = coo_array((np.ones(len(row)), (own, frame[row])), shape=(count, int(frame.max()) + 1)).tocsr()
+    apart = np.asarray(seen[a].multiply(seen[b]).sum(axis=1)).ravel() == 0
+    same = close & alike & apart
+    graph = coo_array((np.ones(same.sum(), bool), (a[same], b[same])), shape=(count, count))
+    _, group = connected_components(graph, directed=False)
+    merged = np.arange(len(points.kept))
+    merged[kept] = kept[np.unique(group, return_index=True)[1]][group]
+    return np.asarray(merged[track])
 
 
 def seen_twice(track: np.ndarray, frame: np.ndarray) -> np.ndarray:
