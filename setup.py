@@ -60,6 +60,7 @@ setup(
             "rosbags==0.11.9",
             "matplotlib>=3.9,<4",
             "pyyaml>=6,<7",
+            "pillow>=10",  # sizes of images; matplotlib needs it anyway
         ],
         # Exact where another version formats or complains differently. The name `test` makes colcon test use pytest.
         "test": [

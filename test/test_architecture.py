@@ -12,7 +12,7 @@ TREES = {path: ast.parse((PACKAGE / path).read_text(encoding="utf-8"), str(path)
 CORE = [p for p in FILES if p.parts[0] == "core"]
 
 GRAPH = ("window.py", "gtsam_bridge.py")  # and core/graph*.py
-ANCHORS = ("extraction.py", "pnp.py", "descriptors.py", "track_odometry.py", "window_lock.py")
+ANCHORS = ("extraction.py", "pnp.py", "descriptors.py", "track_odometry.py", "window_lock.py", "epipolar.py")
 FINDERS = {"cv2", "poselib", "pycolmap", "pytheia", "faiss"}
 ROS = {"rclpy", "xalign_msgs", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "tf2_ros", "rosidl_runtime_py"}
 # What makes the same input give other numbers, or speaks to the world.

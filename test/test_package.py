@@ -234,6 +234,7 @@ def test_commands():
 
 # Import name -> name in package.xml and of the pip distribution, where they differ. None: rosdep has no key.
 ROSDEP = {name: None for name in ("gtsam", "poselib", "qdldl", "mcap", "zstandard", "rosbags", "rich")} | {
+    "PIL": "python3-pil",
     "cv2": "python3-opencv",
     "h5py": "python3-h5py",
     "matplotlib": "python3-matplotlib",
@@ -241,7 +242,7 @@ ROSDEP = {name: None for name in ("gtsam", "poselib", "qdldl", "mcap", "zstandar
     "scipy": "python3-scipy",
     "yaml": "python3-yaml",
 }
-DISTRIBUTION = {"cv2": "opencv-contrib-python-headless", "yaml": "pyyaml"}
+DISTRIBUTION = {"PIL": "pillow", "cv2": "opencv-contrib-python-headless", "yaml": "pyyaml"}
 
 
 def imports(paths):

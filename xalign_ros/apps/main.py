@@ -10,12 +10,14 @@ from collections.abc import Sequence
 import xalign_ros
 from xalign_ros.core.errors import XalignError
 
+OWN_SYNTAX = ("posegraph",)  # VICAR's
 COMMANDS = {
     "demo": "the main job on real input: map built, run replayed, report written",
     "map": "build, inspect and check reference maps",
     "replay": "align a log to a map, without ROS or (--live) through the running node",
     "batch": "smooth whole logs: every keyframe's pose from all the evidence",
     "solve": "solve a pose graph in a g2o file",
+    "posegraph": "poses of images from tiepoints, with the arguments and files of VICAR's POSEGRAPH",
     "log": "what is in a log",
     "node": "the live ROS 2 node",
 }
@@ -25,17 +27,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if words[:1] == ["node"]:  # its arguments are ROS's
         return int(importlib.import_module("xalign_ros.apps.node").main(words[1:]) or 0)
+    own = words[:1] and words[0] in OWN_SYNTAX
     parser = argparse.ArgumentParser(prog="xalign", description="Put a running odometry source onto a map.")
     parser.add_argument("--version", action="version", version=f"xalign {xalign_ros.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in COMMANDS.items():
         sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        if words[:1] == [name] and name != "node":  # the others' imports are not worth waiting for
+        if words[:1] == [name] and not own:  # the others' imports are not worth waiting for
             importlib.import_module(f"xalign_ros.apps.{name}").add_arguments(sub)
-    args = parser.parse_args(words)
+    args = parser.parse_args(words[:1] if own else words)
     args.xalign = main  # the demo runs the commands that a user would
     command = "player" if args.command == "replay" and args.live else args.command
     try:
+        if own:
+            return int(importlib.import_module(f"xalign_ros.apps.{command}").main(words[1:]))
         importlib.import_module(f"xalign_ros.apps.{command}").run(args)
     except XalignError as e:
         print(f"xalign: {e}", file=sys.stderr)
