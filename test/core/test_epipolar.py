@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from xalign_ros.core.epipolar import Bearings, Degenerate, Epipolar, RelativeView, _residuals, relative_view
+from xalign_ros.core.epipolar import (
+    Bearings,
+    Degenerate,
+    Epipolar,
+    RelativeView,
+    _basis,
+    _columns,
+    _residuals,
+    relative_view,
+)
 from xalign_ros.core.lie import so3_exp, so3_log
 from xalign_ros.core.transforms import SE3
 from xalign_ros.core.triangulation import tangent_basis
@@ -50,10 +59,11 @@ def test_exact_ties_give_the_exact_pose(kind: str) -> None:
 
 
 def test_jacobian_is_that_of_differences() -> None:
-    left, right = views("volume", 20, 2.0, 0)
+    left, right = map(_columns, views("volume", 20, 2.0, 0))
     R, t = T_J_K.R.T, -T_J_K.R.T @ T_J_K.t
     _, J = _residuals(R, t, left, right)
-    B, h = tangent_basis(t[None])[0].T, 1e-6
+    B, h = _basis(t), 1e-6
+    np.testing.assert_allclose(np.c_[B, t].T @ np.c_[B, t], np.eye(3), atol=1e-15)
     for k in range(5):
         d = np.eye(5)[k] * h
         ends = []

@@ -178,7 +178,7 @@ def _bearings(view: View, R_site_cam: Array, px: Array) -> tuple[Array, Array, n
     steps = np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
     _, rays, valid = view.camera.rays((px + steps[:, None]).reshape(-1, 2))
     rays = (rays @ R_site_cam).reshape(5, n, 3)
-    ok: np.ndarray = (valid.reshape(5, n) & np.isfinite(rays).all(axis=2)).all(axis=0)
+    ok: Any = (valid.reshape(5, n) & np.isfinite(rays).all(axis=2)).all(axis=0)
     return rays[0], np.stack([rays[1] - rays[2], rays[3] - rays[4]], axis=-1), ok
 
 
