@@ -1,4 +1,4 @@
-"""Text files, read with errors in a sentence and written whole or not at all."""
+"""Files read with errors in a sentence and written whole or not at all."""
 
 from __future__ import annotations
 
@@ -22,9 +22,14 @@ def read_text(path: Path, what: str) -> str:
 
 def write_text(path: Path, lines: Iterable[str]) -> None:
     """The file gets its name when it is complete. Raises FormatError where it cannot be written."""
+    write_bytes(path, "".join(lines).encode())
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """As write_text."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        temporary.write_text("".join(lines), encoding="utf-8")
+        temporary.write_bytes(data)
         os.replace(temporary, path)
     except OSError as error:
         raise FormatError(f"{path} cannot be written: {error.strerror}") from error
