@@ -1,11 +1,12 @@
 """xalign map build from images, hloc and geographic positions: from files to a map that finds a photograph again."""
 
 import json
+from dataclasses import replace
 
 import image_world
 import numpy as np
 import pytest
-from colmap_world import S_MAP_REFMAP, room
+from colmap_world import CAMERAS, S_MAP_REFMAP, room
 from image_world import CAMERA
 
 from xalign_ros.apps.main import main
@@ -13,11 +14,13 @@ from xalign_ros.core.anchor import find_anywhere
 from xalign_ros.core.config import Config
 from xalign_ros.core.extraction import EXTRACTORS
 from xalign_ros.core.geodesy import enu_from_geodetic
+from xalign_ros.core.reconstruction import Reconstruction
 from xalign_ros.core.records import Anchor, Keyframe
 from xalign_ros.core.reference_map import MapIndex
 from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.io.colmap import write_model
 from xalign_ros.io.colmap_records import ColmapCamera, ColmapImage, ColmapModel, ColmapPoints
+from xalign_ros.io.pytheia_binary import write_pytheia
 from xalign_ros.io.tum import Trajectory, write_tum
 from xalign_ros.io.xmap import read_map
 
@@ -124,10 +127,58 @@ def test_hloc_with_geographic_positions(tmp_path, capsys) -> None:
     assert json.loads(capsys.readouterr().out)["georeference"]["latitude_deg"] == pytest.approx(map_.georeference[0])
 
 
+def pytheia_room() -> tuple[Reconstruction, dict[int, SE3]]:
+    """The room's model as pyTheia would have it, tracks with a mean descriptor, and the true T_map_cam by stamp."""
+    world = room()
+    images, points = sorted(world.model.images.values(), key=lambda image: image.id), world.model.points
+    row = {image.id: n for n, image in enumerate(images)}
+    at = np.array([row[i] for i in points.track_image_id])
+    uv = np.array([images[v].uv[k] for v, k in zip(at, points.track_uv_index, strict=True)])
+    seen = np.array([world.descriptors[images[v].name][k] for v, k in zip(at, points.track_uv_index, strict=True)])
+    poses = [SE3(image.R_cam_map, image.t_cam_map).inverse() for image in images]
+    which = sorted(CAMERAS)
+    stamps = 10**9 * (1 + np.arange(len(images)))
+    reconstruction = Reconstruction(
+        view_ids=np.arange(len(images)),
+        names=tuple(image.name for image in images),
+        R=np.array([T.R for T in poses]),
+        t=np.array([T.t for T in poses]),
+        estimated=np.ones(len(images), bool),
+        track_ids=points.ids,
+        points=points.xyz,
+        track_estimated=np.ones(len(points.ids), bool),
+        offsets=points.track_offset,
+        observing_views=at,
+        uv=uv,
+        stamps_ns=stamps,
+        camera=np.array([which.index(image.camera_id) for image in images]),
+        cameras=tuple(CAMERAS[k][1] for k in which),
+        descriptors=np.add.reduceat(seen, points.track_offset[:-1]) / np.diff(points.track_offset)[:, None],
+    )
+    return reconstruction, {int(s): world.T_map_cam[i.name] for s, i in zip(stamps, images, strict=True)}
+
+
+def test_pytheias_binary_with_the_descriptors_of_its_tracks(tmp_path, capsys) -> None:
+    reconstruction, truth = pytheia_room()
+    write_pytheia(reconstruction, tmp_path / "run.recon")
+    R, t = (np.array([getattr(T, name) for T in truth.values()]) for name in ("R", "t"))
+    write_tum(tmp_path / "metric.tum", Trajectory(np.array(list(truth)), R, t))
+    out = tmp_path / "m.xmap"
+    assert build(out, "--pytheia", tmp_path / "run.recon", "--align", tmp_path / "metric.tum") == 0
+    assert "scale 1.7" in capsys.readouterr().err
+    map_ = read_map(out, verify=True)
+    assert map_.metric and map_.descriptor_name == "sift" and map_.descriptors.dtype == np.float32
+    np.testing.assert_allclose(map_.keyframe_t, t, atol=1e-6)
+    assert len(map_.points) > 200
+    write_pytheia(replace(reconstruction, descriptors=None), tmp_path / "bare.recon")
+    assert build(tmp_path / "n.xmap", "--pytheia", tmp_path / "bare.recon") == 1
+    assert "none of its tracks has a descriptor" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "--log, --colmap, --hloc or --images"),
+        ([], "--log, --colmap, --hloc, --pytheia or --images"),
         (["--images", "images"], "--images needs --poses"),
         (["--images", "images", "--poses", "poses.tum"], "--images needs --camera"),
         (

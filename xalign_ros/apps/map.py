@@ -23,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--log", type=Path, metavar="LOG", help="a posed run: its keyframes, with --poses")
     source.add_argument("--colmap", type=Path, metavar="MODEL_DIR", help="a COLMAP model, with --database or --images")
     source.add_argument("--hloc", type=Path, nargs=2, metavar=("MODEL_DIR", "FEATURES"), help="an hloc model")
-    build.add_argument("--images", type=Path, metavar="DIR", help="with --poses and --camera, or with --colmap")
+    source.add_argument("--pytheia", type=Path, metavar="FILE", help="a pyTheia model, with its tracks' descriptors")
+    build.add_argument("--images", type=Path, metavar="DIR", help="with --poses and --camera, --colmap, --pytheia")
     build.add_argument("--poses", type=Path, metavar="TUM_FILE", help="T_map_cam by the keyframes' or images' stamps")
     build.add_argument("--camera", type=Path, metavar="FILE", help="the images' camera: camera_info or Kalibr yaml")
     build.add_argument("--features", metavar="NAME", help="of --images: sift, orb, akaze or your own module:function")
@@ -50,9 +51,9 @@ def run(args: argparse.Namespace) -> None:
 def _build(args: argparse.Namespace) -> None:
     if args.output.exists() and not args.force:
         raise MapError(f"{args.output} exists; give another name or --force to replace it")
-    source = args.log or args.colmap or (args.hloc and args.hloc[0]) or args.images
+    source = args.log or args.colmap or (args.hloc and args.hloc[0]) or args.pytheia or args.images
     if source is None:
-        raise MapError("a map is made from --log, --colmap, --hloc or --images; see xalign map build --help")
+        raise MapError("a map is made from --log, --colmap, --hloc, --pytheia or --images; see xalign map build --help")
     if args.max_points is not None and args.max_points < 1:
         raise MapError(f"--max-points {args.max_points}: a map needs points; give a positive number")
     try:

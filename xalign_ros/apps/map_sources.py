@@ -1,4 +1,4 @@
-"""What `xalign map build` makes maps from: a posed log, posed images, COLMAP, hloc; and how they come to be metric."""
+"""What `xalign map build` makes maps from: posed logs and images, COLMAP, hloc, pyTheia; and how they come to be metric."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ from xalign_ros.core.camera import Camera
 from xalign_ros.core.errors import MapError
 from xalign_ros.core.geodesy import enu_from_geodetic
 from xalign_ros.core.map_building import build_map
-from xalign_ros.core.reconstruction_map import PosedReconstruction, build_map_from_reconstruction, transformed
+from xalign_ros.core.reconstruction_map import (
+    PosedReconstruction,
+    build_map_from_reconstruction,
+    described_tracks,
+    posed_views,
+    stamps_of,
+    transformed,
+)
 from xalign_ros.core.records import Keyframe
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.similarity import fit_similarity_robust
@@ -27,6 +34,7 @@ from xalign_ros.io.hloc import read_hloc_reconstruction
 from xalign_ros.io.images import extractor, image_features, image_names
 from xalign_ros.io.log import Log
 from xalign_ros.io.progress_bar import progress_bar
+from xalign_ros.io.pytheia_binary import read_pytheia
 from xalign_ros.io.tum import pose_at, read_tum, seconds_to_ns
 
 
@@ -48,22 +56,25 @@ def map_of(args: argparse.Namespace) -> ReferenceMap:
         )
     if args.images is not None:
         return _of_images(args)
-    model_dir = args.colmap or args.hloc[0]
+    name, stamps = args.descriptor or "", None
     if args.colmap is not None:
-        model = read_colmap_reconstruction(model_dir, args.database, args.descriptor or "")
+        model, source = read_colmap_reconstruction(args.colmap, args.database, name), f"COLMAP model {args.colmap}"
+    elif args.hloc is not None:
+        model, source = read_hloc_reconstruction(args.hloc[0], args.hloc[1], name), f"hloc model {args.hloc[0]}"
     else:
-        model = read_hloc_reconstruction(model_dir, args.hloc[1], args.descriptor or "")
+        reconstruction, source = read_pytheia(args.pytheia), f"pyTheia model {args.pytheia}"
+        model, stamps = described_tracks(reconstruction, name or "sift"), stamps_of(reconstruction)
+    if args.colmap is None:
         print(f"the descriptors are called '{model.descriptor_name}'; a keyframe's must be too", file=sys.stderr)
-    placed = _place(args, model.names, model.T_map_cam, metric=False)
+    placed = _place(args, model.names, model.T_map_cam, metric=False, stamps=stamps)
     moved: PosedReconstruction = transformed(model, placed.S_map_refmap, metric=placed.metric)
-    kind = "COLMAP" if args.colmap is not None else "hloc"
-    map_ = build_map_from_reconstruction(moved, map_id=args.output.stem, source=f"{kind} model {model_dir}")
+    map_ = build_map_from_reconstruction(moved, map_id=args.output.stem, source=source)
     return replace(map_, georeference=placed.georeference)
 
 
 def _refuse_strangers(args: argparse.Namespace) -> None:
     """Options that this source has no use for, and those it cannot do without."""
-    source = next((s for s in ("log", "colmap", "hloc") if getattr(args, s) is not None), "images")
+    source = next((s for s in ("log", "colmap", "hloc", "pytheia") if getattr(args, s) is not None), "images")
     needs = {"log": ["poses"], "images": ["images", "poses", "camera"]}.get(source, [])
     if source == "colmap" and args.images is None:
         needs = ["database"]
@@ -72,6 +83,7 @@ def _refuse_strangers(args: argparse.Namespace) -> None:
         "images": ("poses", "camera", "features"),
         "colmap": ("database", "descriptor") if args.images is None else ("images", "features"),
         "hloc": ("descriptor",),
+        "pytheia": ("descriptor",) if args.images is None else ("images", "features"),
     }[source]
     for option in needs:
         if getattr(args, option) is None:
@@ -91,8 +103,9 @@ def _of_keyframes(
     source: str,
     *,
     metric: bool,
+    stamps: Sequence[int] | None = None,
 ) -> ReferenceMap:
-    placed = _place(args, names, poses, metric=metric)
+    placed = _place(args, names, poses, metric=metric, stamps=stamps)
     poses = [(placed.S_map_refmap @ T).rigid_pose() for T in poses]
     map_ = build_map(
         keyframes, poses, map_id=args.output.stem, source=source, metric=placed.metric, progress=progress_bar
@@ -103,9 +116,15 @@ def _of_keyframes(
 def _of_images(args: argparse.Namespace) -> ReferenceMap:
     """Of images with the poses and cameras of a COLMAP model, or with a camera file and poses by their stamps."""
     extract = extractor(args.features or "sift")
+    stamps = None
     if args.colmap is not None:
         names, cameras, poses = model_cameras(args.colmap)
         source = f"images {args.images}, poses of COLMAP model {args.colmap}"
+    elif args.pytheia is not None:
+        reconstruction = read_pytheia(args.pytheia)
+        names, cameras, poses = posed_views(reconstruction)
+        stamps = stamps_of(reconstruction)
+        source = f"images {args.images}, poses of pyTheia model {args.pytheia}"
     else:
         names, cameras, poses = posed_images(args.images, args.poses, read_camera(args.camera))
         source = f"images {args.images}, poses {args.poses.name}"
@@ -113,7 +132,8 @@ def _of_images(args: argparse.Namespace) -> ReferenceMap:
     for n, name in progress_bar(list(enumerate(names)), "extracting features"):
         features = image_features(args.images / name, cameras[n], extract)
         keyframes.append(Keyframe(n, 0, n, poses[n], cameras[n], features))
-    return _of_keyframes(args, names, keyframes, poses, source, metric=args.colmap is None)
+    metric = args.colmap is None and args.pytheia is None
+    return _of_keyframes(args, names, keyframes, poses, source, metric=metric, stamps=stamps)
 
 
 def posed_images(folder: Path, poses_path: Path, camera: Camera) -> tuple[list[str], list[Camera], list[SE3]]:
@@ -156,15 +176,23 @@ def posed_keyframes(log_path: Path, poses_path: Path, topic: str | None) -> tupl
     return [str(k.stamp_ns) for k in keyframes], keyframes, poses
 
 
-def _place(args: argparse.Namespace, names: Sequence[str], T_refmap_cam: Sequence[SE3], *, metric: bool) -> Placed:
-    """As --scale, --align or --georeference say, else as it is."""
+def _place(
+    args: argparse.Namespace,
+    names: Sequence[str],
+    T_refmap_cam: Sequence[SE3],
+    *,
+    metric: bool,
+    stamps: Sequence[int] | None = None,
+) -> Placed:
+    """As --scale, --align or --georeference say, else as it is. stamps in ns, where names do not tell them."""
     if args.scale is not None:
         if not 0 < args.scale < np.inf:
             raise MapError(f"--scale {args.scale}: the metres per unit of the model are a positive number")
         return Placed(Sim3(np.eye(3), np.zeros(3), args.scale), True)
     if args.align is not None:
         truth = read_tum(args.align)
-        stamped = {name: pose_at(truth, image_stamp_ns(name)) for name in names}
+        stamps = stamps or [image_stamp_ns(name) for name in names]
+        stamped = {name: pose_at(truth, stamp) for name, stamp in zip(names, stamps, strict=True)}
         known = {name: T.t for name, T in stamped.items() if T is not None}
         return Placed(_fitted(args.align, known.get, names, T_refmap_cam), True)
     if args.georeference is not None:

@@ -10,6 +10,7 @@ import numpy as np
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.lie import Array
 from xalign_ros.core.map_building import Observations, map_of_points, reprojection_sigma_px
+from xalign_ros.core.reconstruction import Reconstruction
 from xalign_ros.core.records import Norm
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3, Sim3, frozen
@@ -91,6 +92,53 @@ def with_keyframes(reconstruction: PosedReconstruction, keep: Sequence[int]) -> 
         descriptors=tuple(r.descriptors[k] for k in keep),
         point=tuple(r.point[k] for k in keep),
     )
+
+
+def posed_views(r: Reconstruction) -> tuple[list[str], list[Camera], list[SE3]]:
+    """Names of the views that have a pose and a camera, with camera and T_map_cam. Raises ValueError where there is none."""
+    rows = _usable(r)
+    camera = [] if r.camera is None else [r.cameras[k] for k in r.camera[rows]]
+    return [r.names[v] for v in rows], camera, [SE3(r.R[v], r.t[v]) for v in rows]
+
+
+def stamps_of(r: Reconstruction) -> list[int] | None:
+    """Stamps (ns) of the views that have a pose and a camera; None where they are not told, or not apart."""
+    stamps = [] if r.stamps_ns is None else r.stamps_ns[_usable(r)].tolist()
+    return stamps if stamps and len(set(stamps)) == len(stamps) else None
+
+
+def described_tracks(r: Reconstruction, descriptor_name: str) -> PosedReconstruction:
+    """The views that have a pose and a camera, with the tracks that have a point and a descriptor, the same in each view.
+
+    Raises ValueError where no view has a pose and a camera, or no track a descriptor.
+    """
+    names, _, poses = posed_views(r)
+    views = _usable(r)
+    if r.camera is None or r.descriptors is None:
+        raise ValueError("none of its tracks has a descriptor; set them before writing, or give the images")
+    told = r.track_estimated & np.isfinite(r.descriptors).all(axis=1)
+    track = np.repeat(np.arange(len(r.points)), np.diff(r.offsets))
+    rows = [np.flatnonzero((r.observing_views == v) & told[track]) for v in views]
+    new = np.cumsum(told) - 1
+    return PosedReconstruction(
+        cameras=r.cameras,
+        keyframe_camera=r.camera[views],
+        names=tuple(names),
+        T_map_cam=tuple(poses),
+        uv=tuple(r.uv[o] for o in rows),
+        descriptors=tuple(r.descriptors[track[o]] for o in rows),
+        point=tuple(new[track[o]] for o in rows),
+        points=r.points[told],
+        descriptor_name=descriptor_name,
+        norm=Norm.L2_FLOAT32,
+    )
+
+
+def _usable(r: Reconstruction) -> np.ndarray:
+    rows = np.flatnonzero(r.estimated & (r.camera >= 0)) if r.camera is not None else np.zeros(0, np.int64)
+    if not len(rows):
+        raise ValueError(f"none of its {len(r.names)} views has both a pose and a camera")
+    return rows
 
 
 def build_map_from_reconstruction(
