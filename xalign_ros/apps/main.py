@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import xalign_ros
 from xalign_ros.core.errors import XalignError
 
-OWN_SYNTAX = ("posegraph",)  # VICAR's
+OWN_SYNTAX = ("posegraph", "keyframes")  # VICAR's
 COMMANDS = {
     "demo": "the main job on real input: map built, run replayed, report written",
     "map": "build, inspect and check reference maps",
@@ -18,6 +18,7 @@ COMMANDS = {
     "batch": "smooth whole logs: every keyframe's pose from all the evidence",
     "solve": "solve a pose graph in a g2o file",
     "posegraph": "poses of images from tiepoints, with the arguments and files of VICAR's POSEGRAPH",
+    "keyframes": "good keyframes among images with ties, as VICAR's keyframe_selection finds them",
     "log": "what is in a log",
     "node": "the live ROS 2 node",
 }

@@ -29,7 +29,8 @@ from xalign_ros.core.tie_graph import (
     telemetry_edge,
     weak_edge,
 )
-from xalign_ros.core.ties import PAIRED, Ties
+from xalign_ros.core.tie_selection import active
+from xalign_ros.core.ties import Ties
 from xalign_ros.io.g2o import G2o, write_g2o
 from xalign_ros.io.tae import image_numbers
 from xalign_ros.io.vicar_list import read_image_list
@@ -63,7 +64,8 @@ def posegraph(options: Options, say: Callable[[str], None] = lambda _: None) -> 
     views = loaded.views
     references = _references(options, len(views))
     all_ties = placed(read_ties(options.in_tpt), views, options.in_tpt, note)
-    ties, counts = _active(options, all_ties, references or (), len(views))
+    ignored = image_numbers("IGNORE", options.ignore, len(views))
+    ties, counts = active(all_ties, len(views), ignored, references or (), options.ignore_intra)
     used = ties.of_two
     if (~used).any():
         note(f"{(~used).sum()} ties of types that say nothing of relative poses are left out")
@@ -107,16 +109,6 @@ def _references(options: Options, n: int) -> tuple[int, ...] | None:
         return None
     numbers = image_numbers("REFIMAGE", options.refimage, n)
     return tuple(range(options.refimage[0])) if options.until else numbers
-
-
-def _active(options: Options, ties: Ties, references: Sequence[int], n: int) -> tuple[Ties, tuple[int, int]]:
-    """Ties that IGNORE and IGNORE_INTRA leave, and how many each takes."""
-    paired = np.isin(ties.type, PAIRED)
-    ignored = np.isin(np.arange(n + 1), image_numbers("IGNORE", options.ignore, n))  # the last is for no image
-    gone = ignored[ties.left] | ignored[ties.right]
-    held = np.isin(np.arange(n + 1), references)
-    intra = options.ignore_intra & ~gone & (~paired | (held[ties.left] == held[ties.right]))
-    return ties.take(~gone & ~intra), (int(gone.sum()), int(intra.sum()))
 
 
 def _edges(options: Options, pairs: list[Pair]) -> tuple[Edge, ...]:
