@@ -10,6 +10,7 @@ from xalign_ros.core.epipolar import Epipolar
 from xalign_ros.core.lie import so3_exp, so3_log
 from xalign_ros.core.pointing import View, from_six, generic, parameters_of, pose_of, view_of
 from xalign_ros.core.pose_graph import Loss
+from xalign_ros.core.resection import anchors_of, resections
 from xalign_ros.core.tie_graph import (
     Gates,
     components,
@@ -185,3 +186,50 @@ def test_six_parameters_are_yaw_pitch_roll() -> None:
     T = pose_of(from_six(np.array([30.0, 20, 10]), np.array([1.0, 2, 3])))
     np.testing.assert_allclose(T.R, R, atol=1e-12)
     np.testing.assert_allclose(T.t, [1, 2, 3])
+
+
+def known(view: View, n: int, noise_px: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels and places, in the site, of n points before an image."""
+    px = rng.uniform(40, 440, (n, 2))
+    origin, rays, _ = view.camera.rays(px)
+    return px + rng.normal(0, noise_px, px.shape), origin + rays * rng.uniform(3, 9, (n, 1))
+
+
+def fiducials(view: View, image: int, n: int, noise_px: float, seed: int = 0) -> Ties:
+    px, xyz = known(view, n, noise_px, np.random.default_rng(seed))
+    ties = ties_of(np.full(n, image), np.full(n, -1), px, px)
+    return replace(ties, type=np.ones(n, int), xyz=xyz)
+
+
+def test_known_places_tell_scale_and_place() -> None:
+    """Two anchored images bring the whole graph home, the length of it included, whatever telemetry said."""
+    truth, ties = world()
+    start = disturbed([v.at(SE3(v.T_site_body.R, 1.02 * v.T_site_body.t)) for v in truth])
+    found = [r for n in (0, 3) for r in resections(fiducials(truth[n], n, 8, 0.0), start, 0)]
+    assert [r.image for r in found] == [0, 3] and all(r.inliers == 8 for r in found)
+    after, solution = solved(start, graph_of(start, edges_of(ties, start), [], Loss(), anchors_of(found, Loss())))
+    assert solution.gauge == ""
+    for n in (0, 3):
+        assert off(after[n], truth[n])[1] < 5e-3
+    assert max(off(a, b)[1] for a, b in zip(after, truth, strict=True)) < 0.03
+
+
+def test_the_covariance_of_a_resection_is_true() -> None:
+    (v, *_), _ = world(0.0, 2)
+    nees = []
+    for seed in range(60):
+        (r,) = resections(fiducials(v, 0, 20, 1.0, seed), [v], 0)
+        d = r.T_site_body.inverse() @ v.T_site_body
+        x = np.r_[so3_log(d.R), d.t]
+        nees.append(x @ np.linalg.solve(r.cov, x))
+    assert 4.5 < np.mean(nees) < 9
+
+
+def test_too_few_or_wrong_places_anchor_nothing() -> None:
+    (v, *_), _ = world(0.0, 2)
+    (few,) = resections(fiducials(v, 0, 3, 0.0), [v], 0)
+    assert few.T_site_body is None and "fewer than 4" in few.reason
+    wrong = fiducials(v, 0, 12, 0.0)
+    (r,) = resections(replace(wrong, xyz=np.r_[wrong.xyz[:4] + 2.0, wrong.xyz[4:]]), [v], 0)
+    assert r.inliers == 8 and off(v.at(r.T_site_body), v)[1] < 1e-6
+    assert anchors_of([few], Loss()) is None

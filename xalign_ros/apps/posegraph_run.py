@@ -14,6 +14,7 @@ from xalign_ros.core.errors import FormatError
 from xalign_ros.core.lie import Array
 from xalign_ros.core.pointing import Pointing, View
 from xalign_ros.core.pose_graph import PoseGraph
+from xalign_ros.core.resection import anchors_of, resections
 from xalign_ros.core.tie_graph import (
     Edge,
     Gates,
@@ -66,31 +67,40 @@ def posegraph(options: Options, say: Callable[[str], None] = lambda _: None) -> 
     all_ties = placed(read_ties(options.in_tpt), views, options.in_tpt, note)
     ignored = image_numbers("IGNORE", options.ignore, len(views))
     ties, counts = active(all_ties, len(views), ignored, references or (), options.ignore_intra)
+    found = resections(ties, views, options.seed)
+    anchors = anchors_of(found, options.robust())
     used = ties.of_two
-    if (~used).any():
-        note(f"{(~used).sum()} ties of types that say nothing of relative poses are left out")
+    unsupported = int((~used & ~ties.absolute).sum())
+    if unsupported:
+        note(f"{unsupported} ties of types that say nothing of poses are left out")
     ties = ties.take(used)
-    if not len(ties):
+    if not len(ties) and anchors is None:
         raise FormatError(f"{options.in_tpt} has no tie that is used: of {len(all_ties)} none is left")
+    if references is None and anchors is not None:
+        note(f"{len(anchors)} images are anchored to known places, so no image is held; REFIMAGE would hold one")
+        references = ()
     if references is None:
         references = (most_connected(ties, len(views)),)
     if not options.use_essential:
         note("without -USE_ESSENTIAL the edges repeat telemetry, so the result cannot be better than it")
     edges = _edges(options, pairs_of(cropped(ties, views, options.edge_dist), views))
-    graph = graph_of(views, edges, references, options.robust())
+    graph = graph_of(views, edges, references, options.robust(), anchors)
     after, solution = views, None
-    if any(edge.T_a_b is not None for edge in edges):
+    if anchors is not None or any(edge.T_a_b is not None for edge in edges):
         after, solution = solved(views, graph)
         if not solution.converged:
             note("the solve has not converged; what is written is the best found")
     result = Result(
-        views, after, references, len(all_ties), *counts, int((~used).sum()), connectivity(ties, len(views)), edges,
-        solution, tuple(notes),
+        views, after, references, len(all_ties), *counts, unsupported, connectivity(ties, len(views)), edges,
+        solution, tuple((f.image, f.ties, f.inliers, f.reason) for f in found), tuple(notes),
     )  # fmt: skip
+    known = {*references, *(f.image for f in found if f.T_site_body is not None)}
     for part in result.edge_components:
-        if not set(part) & set(references) and len(part) > 1:
-            note(f"images {_listed(part)} hang together without a reference; the first of them is held")
-    lone = [part[0] for part in result.edge_components if len(part) == 1 and part[0] not in references]
+        if not set(part) & known and len(part) > 1:
+            note(
+                f"images {_listed(part)} hang together without a reference or a known place; the first of them is held"
+            )
+    lone = [part[0] for part in result.edge_components if len(part) == 1 and part[0] not in known]
     if lone:
         note(f"images {_listed(lone)} have no edge and keep their telemetry pose")
     _write(options, loaded, ties, graph, result)

@@ -135,16 +135,12 @@ def _sample(left: Bearings, right: Bearings, seed: int, config: Epipolar) -> tup
     usable = np.flatnonzero((left.rays[:, 2] > limit) & (right.rays[:, 2] > limit))
     if len(usable) < config.min_ties:
         return None
-    flat, cameras = [], []
-    for view in (left, right):
-        f, size = view.focal_px, int(2 * view.focal_px * np.tan(MAX_RAY_RAD)) + 1
-        flat.append(f * view.rays[usable, :2] / view.rays[usable, 2:])
-        cameras.append({"model": "PINHOLE", "width": size, "height": size, "params": [f, f, 0.0, 0.0]})
+    (flat_j, camera_j), (flat_k, camera_k) = _flat(left, usable), _flat(right, usable)
     pose, info = poselib.estimate_relative_pose(
-        flat[0],
-        flat[1],
-        cameras[0],
-        cameras[1],
+        flat_j,
+        flat_k,
+        camera_j,
+        camera_k,
         {
             "max_epipolar_error": config.threshold_px,
             "seed": seed,
@@ -158,6 +154,27 @@ def _sample(left: Bearings, right: Bearings, seed: int, config: Epipolar) -> tup
     if info["num_inliers"] < config.min_ties or not (np.isfinite(R).all() and np.isfinite(t).all() and t.any()):
         return None
     return R, t / np.linalg.norm(t)
+
+
+def sample_absolute(seen: Bearings, xyz: Array, seed: int, threshold_px: float) -> SE3 | None:
+    """T_site_cam by LO-RANSAC from rays to known places (N, 3)."""
+    usable = np.flatnonzero(seen.rays[:, 2] > np.cos(MAX_RAY_RAD))
+    if len(usable) < 4:
+        return None
+    flat, camera = _flat(seen, usable)
+    options = {"max_reproj_error": threshold_px, "seed": seed, "max_iterations": 1000, "min_iterations": 100}
+    pose, info = poselib.estimate_absolute_pose(flat, xyz[usable], camera, options, {"max_iterations": 0})
+    R, t = np.asarray(pose.R), np.asarray(pose.t)
+    if info["num_inliers"] < 4 or not (np.isfinite(R).all() and np.isfinite(t).all()):
+        return None
+    return SE3(R, t).inverse()
+
+
+def _flat(view: Bearings, usable: np.ndarray) -> tuple[Array, dict[str, object]]:
+    """Pixels (N, 2) of a virtual pinhole, and that."""
+    f, size = view.focal_px, int(2 * view.focal_px * np.tan(MAX_RAY_RAD)) + 1
+    camera = {"model": "PINHOLE", "width": size, "height": size, "params": [f, f, 0.0, 0.0]}
+    return f * view.rays[usable, :2] / view.rays[usable, 2:], camera
 
 
 def _columns(view: Bearings) -> Array:

@@ -70,7 +70,7 @@ class Edge:
 class Result:
     """Images before and after, held ones, ties that were read, used, left out by IGNORE and IGNORE_INTRA, the edges.
 
-    `solution` is None where there is no edge.
+    `solution` is None where there is neither edge nor anchor. `anchors`: image, known places, inliers, and why it is none.
     """
 
     before: tuple[View, ...]
@@ -83,6 +83,7 @@ class Result:
     matrix: np.ndarray
     edges: tuple[Edge, ...]
     solution: Solution | None
+    anchors: tuple[tuple[int, int, int, str], ...]
     notes: tuple[str, ...]
 
     @property
@@ -170,6 +171,12 @@ def pairs_of(ties: Ties, views: Sequence[View]) -> list[Pair]:
             )
         )
     return out
+
+
+def bearings_of(view: View, px: Array) -> tuple[Bearings, np.ndarray]:
+    """Of pixels (N, 2) of an image, and which are valid."""
+    rays, per_px, valid = _bearings(view, (view.T_site_body @ view.T_body_cam).R, px)
+    return Bearings(rays, per_px, float(np.mean(view.camera.intrinsics()[:2]))), valid
 
 
 def _bearings(view: View, R_site_cam: Array, px: Array) -> tuple[Array, Array, np.ndarray]:

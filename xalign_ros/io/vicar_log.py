@@ -47,6 +47,8 @@ def log_lines(options: Options, r: Result) -> Iterator[str]:
             turn, shift = np.rad2deg(edge.rotation_error_rad), edge.position_error
             yield f"     Off telemetry by {turn:.3f} deg and {shift:.1%} of the baseline"
         yield f"     {'no edge: ' if edge.T_a_b is None else 'edge'}{edge.reason and edge.T_a_b and ': '}{edge.reason}"
+    for image, ties, inliers, reason in r.anchors:
+        yield f"Image {image}: {ties} known places, {reason or f'anchored by {inliers}'}"
     yield f"Images that ties connect: {_parts(r.tie_components)}"
     yield f"Images that edges connect: {_parts(r.edge_components)}"
     yield f"Number of poses: {len(r.before)}"
@@ -95,6 +97,7 @@ def as_json(r: Result) -> dict[str, Any]:
         "tie_components": r.tie_components,
         "edge_components": r.edge_components,
         "pairs": [_pair(edge) for edge in r.edges],
+        "anchors": [{"image": i, "ties": n, "inliers": k, "reason": why} for i, n, k, why in r.anchors],
         "edges": sum(edge.T_a_b is not None for edge in r.edges),
         "initial_cost": s.initial_cost if s else 0.0,
         "cost": s.cost if s else 0.0,
