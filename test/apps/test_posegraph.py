@@ -124,6 +124,56 @@ def test_held_ignored_and_unheld_images(synth: Path, capsys) -> None:
     assert [p["images"] for p in pairs] == [[0, 1], [0, 2], [0, 3]] and all(p["edge"] for p in pairs)
 
 
+def test_fiducials_put_the_run_onto_the_map(synth: Path, capsys) -> None:
+    """Eight in images 0 and 3 each, from the truth: all poses come to it, not only their directions."""
+    rows = []
+    for n, p in enumerate(read_nav_xml("truth.nav").solution()):
+        px = np.random.default_rng(n).uniform(60, 420, (8, 2))
+        origin, rays, _ = p.camera.rays(px)
+        for (samp, line), xyz in zip(px, origin + rays * np.linspace(3, 9, 8)[:, None], strict=True):
+            where = " ".join(f'{axis}="{v:.9f}"' for axis, v in zip("xyz", xyz, strict=True))
+            if n in (0, 3):
+                rows.append(
+                    f'<tie type="{1 if n else 5}" left_key="{n}"><left line="{line:.9f}" samp="{samp:.9f}"/>'
+                    f'<xyz {where}/><flags quality="1" interactive="1"/></tie>'
+                )
+    text = Path("ties.tpt").read_text().replace("</tiepoints>", "\n".join(rows) + "</tiepoints>")
+    Path("known.tpt").write_text(text)
+    assert run("-USE_ESSENTIAL", "--json", ties="known.tpt") == 0
+    said = capsys.readouterr()
+    result = json.loads(said.out)
+    assert [(a["image"], a["inliers"], a["reason"]) for a in result["anchors"]] == [(0, 8, ""), (3, 8, "")]
+    assert result["references"] == [] and result["gauge"] == "" and "anchored to known places" in said.err
+    for a, b in zip(poses("out.nav"), poses("truth.nav"), strict=True):
+        assert np.linalg.norm(a.t - b.t) < 0.03
+    assert run("-USE_ESSENTIAL", "ref=1", "--json", ties="known.tpt") == 0
+    assert json.loads(capsys.readouterr().out)["references"] == [0]
+
+
+def test_weak_telemetry_lets_no_part_float(data_dir: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    folder = data_dir / "vicar/mer1_navcam_pan"
+    monkeypatch.chdir(tmp_path)
+    words = [f"inp={folder}/images.lis", f"in_tpt={folder}/ties.tpt", f"navtable={folder}/telemetry_7dof.nav"]
+    words += [
+        "out=out.nav",
+        "out_g2o=out.g2o",
+        "out_sol=x",
+        f"config_path={folder}",
+        "-USE_ESSENTIAL",
+        "-WEAK",
+        "--json",
+    ]
+    assert main(["posegraph", *words]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["edge_components"] == [[0, 1], [2, 3, 4]]
+    assert result["pairs"][0]["edge"] and result["pairs"][0]["reason"].startswith("weak, of telemetry: median parallax")
+
+
+def test_a_picture_of_the_graph(synth: Path) -> None:
+    assert run("-USE_ESSENTIAL", "picture=graph.png") == 0
+    assert Path("graph.png").read_bytes().startswith(b"\x89PNG") and Path("graph.png").stat().st_size > 5000
+
+
 def test_text_in_and_text_out(synth: Path, capsys) -> None:
     assert run("-USE_ESSENTIAL", "format=TXT", nav="telemetry_txt.nav") == 0
     assert "three decimals" in capsys.readouterr().err

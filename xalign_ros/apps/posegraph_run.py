@@ -39,6 +39,7 @@ from xalign_ros.io.vicar_matrix import write_connectivity
 from xalign_ros.io.vicar_nav import Nav, write_nav_xml
 from xalign_ros.io.vicar_nav_text import write_nav_text
 from xalign_ros.io.vicar_parameters import Options
+from xalign_ros.io.vicar_picture import write_picture
 from xalign_ros.io.vicar_poses import write_poses
 from xalign_ros.io.vicar_ties import read_ties
 from xalign_ros.io.vicar_ties_xml import write_ties_xml
@@ -168,6 +169,8 @@ def _write(options: Options, loaded: Loaded, ties: Ties, graph: PoseGraph, resul
         write_poses("poses_optimized.txt", [v.T_site_body for v in after])
         R, t = (np.array([getattr(v.T_site_body, part) for v in after]) for part in ("R", "t"))
         write_g2o("poses_optimized.g2o", g2o, R, t, graph.s)
+    if options.picture:
+        write_picture(options.picture, result)
     if options.out_tpt:
         write_ties_xml(options.out_tpt, ties, tuple(v.unique_ids[0] for v in before), options.start_key)
     if options.format == "TXT":

@@ -87,6 +87,7 @@ class Options:
         0.1,
     )
     out_tpt: str | None = parameter("The ties that were used, in XML.", None)
+    picture: str | None = parameter("The pose graph before and after, from above, as a PNG.", None)
     information: str = parameter(
         "What weighs the edges: their covariance, or the identity that POSEGRAPH writes.",
         "COVARIANCE",
