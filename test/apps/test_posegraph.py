@@ -214,6 +214,7 @@ def test_the_opportunity_pan(data_dir: Path, tmp_path: Path, monkeypatch, capsys
         (("SYN_0001.cahv", "C=0 0 0\nA=0 0 1\nH=500 0 320\nV=0 510 240\n"), [], "its size is unknown"),
         (("telemetry.nav", "x"), [], "telemetry.nav line 1 is neither"),
         (None, ["solution_id=other"], "has no solution 'other', only telem_example"),
+        (None, ["out_tpt=none/used.tpt"], "none/used.tpt cannot be written: none is no folder"),
         (None, ["ref=9"], "REFIMAGE names image 9; the list has images 1 to 4"),
         (None, ["ignore=(1,-4)"], "no tie that is used"),
         (None, ["in_tpt=none"], "none cannot be read"),

@@ -82,6 +82,7 @@ def test_a_mirrored_image_has_a_pose_too() -> None:
         (dict(A=[0, 0, 2]), "length 2"),
         (dict(H=[0, 0, 320]), "no focal length"),
         (dict(V=[510, 0, 240]), "one plane"),
+        (dict(H=[5e9, 0, 320]), "focal length is 5e"),
         (dict(C=[np.nan, 0, 0]), "not finite"),
         (dict(O=[0, 0, 1]), "come together"),
         (dict(O=[0, 0, 1], R=[0, 0, 0], E=[0, 0, 0], mtype=7), "type 7"),

@@ -63,6 +63,7 @@ def test_a_list_takes_comments_blanks_and_carriage_returns(tmp_path: Path) -> No
     [
         ("# none\n", "names no image"),
         ("a\nb\na\n", "names a twice"),
+        ("a\n./\n", "which is a folder"),
         ("a" * 300 + "\n", "line 1: a name of 300"),
         ("".join(f"{n}\n" for n in range(2001)), "2001 images"),
     ],

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -61,6 +62,7 @@ def posegraph(options: Options, say: Callable[[str], None] = lambda _: None) -> 
 
     for name in options.without_effect():
         note(f"{name} has no effect")
+    _check_outputs(options)
     names = read_image_list(options.inp)
     loaded = read_views(names, options.navtable, options.solution_id, search_path(options.config_path), note)
     views = loaded.views
@@ -110,6 +112,16 @@ def posegraph(options: Options, say: Callable[[str], None] = lambda _: None) -> 
 
 def _listed(images: Sequence[int]) -> str:
     return ", ".join(map(str, images[:10])) + (f" and {len(images) - 10} more" if len(images) > 10 else "")
+
+
+def _check_outputs(options: Options) -> None:
+    """All are written at the end, so a folder that takes none is told before anything is."""
+    for path in (options.out, options.out_g2o, options.out_tpt, options.picture):
+        folder = Path(path).parent if path else Path()
+        if not (folder.is_dir() and os.access(folder, os.W_OK)):
+            raise FormatError(f"{path} cannot be written: {folder} is no folder to write to")
+        if path and Path(path).is_dir():
+            raise FormatError(f"{path} cannot be written: it is a folder")
 
 
 def _references(options: Options, n: int) -> tuple[int, ...] | None:

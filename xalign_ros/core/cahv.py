@@ -14,6 +14,7 @@ from xalign_ros.core.transforms import SE3, frozen
 
 NEWTON = 100
 SMALL = 1e-8
+MAX_FOCAL_PX = 1e7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +51,8 @@ class Cahv:
                 raise ValueError(f"{name} has length {np.linalg.norm(value):g}, it must be 1")
         if not min(np.linalg.norm(np.cross(self.A, self.H)), np.linalg.norm(np.cross(self.A, self.V))) > 1e-6:
             raise ValueError("H or V is along A, so there is no focal length")
+        if not max(self.intrinsics()[:2]) < MAX_FOCAL_PX:
+            raise ValueError(f"the focal length is {max(self.intrinsics()[:2]):g} pixels")
         if not abs(self._handed()) > 1e-6 * np.linalg.norm(self.H) * np.linalg.norm(self.V):
             raise ValueError("A, H and V lie in one plane")
         if self.E is not None and (self.mtype not in (1, 2, 3) or not abs(self.mparm) <= 1):

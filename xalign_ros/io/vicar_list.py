@@ -51,6 +51,9 @@ def _checked(names: tuple[str, ...], where: str) -> tuple[str, ...]:
     )
     if twice:
         raise FormatError(f"{where} names {twice} twice")
+    nameless = next((name for name in names if Path(name).name in ("", "..")), None)
+    if nameless is not None:
+        raise FormatError(f"{where} names '{nameless}', which is a folder and no image")
     return names
 
 
