@@ -43,9 +43,9 @@ $(STAMP):
 	@$(PY) -m pip install -q --disable-pip-version-check uv==0.13.8
 	@echo 'setup: ROS 2 and solver wheels (about 1.1 GB installed), compiling the messages; half a minute on a good line'
 	@# reinstall: uv would take the messages of an earlier build from its cache. pip: knows mirrors that uv does not.
-	@$(VENV)/bin/uv pip install -q --python $(PY) --reinstall-package xalign-msgs ./msg_defs -e '.[wheels,algo,test]' \
+	@$(VENV)/bin/uv pip install -q --python $(PY) --reinstall-package xalign-msgs ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,test]' \
 	  || { echo 'setup: once more with pip' >&2; $(PY) -m pip install -q -U pip \
-	       && $(PY) -m pip install -q ./msg_defs -e '.[wheels,algo,test]'; }
+	       && $(PY) -m pip install -q ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,test]'; }
 	@rm -f $(VENV)/.done-*
 	@touch $@
 	@echo 'setup: done'

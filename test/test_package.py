@@ -30,6 +30,7 @@ HASHES = {
     "Anchor": "RIHS01_2a9d89af6db2399f5af83e5f4db1fd51911fdc502e71dcee92e654e14793ed5b",
     "Correction": "RIHS01_ef2b305af0dbbc0e2f37b9151703917b7665cc17500d376195b2a16db3f6cc00",
     "Features": "RIHS01_5910a174fe78065cb623c4a91590c69d3457bb52cb140bc52edfe23e2b4bc08a",
+    "Jump": "RIHS01_297fd707e16c3b01cf77666380049d7f61d7ad820779a55472e769b47efedeb9",
     "Keyframe": "RIHS01_87252deb3d31ad43aa4be28eaf1936f1f7c8a39d556c9df568078f3a943acc65",
     "Sim3": "RIHS01_4dfdc08c4e5b32dfe5149849f8b8831ca0d28d6ac5b9931a2001df68703bf6e0",
 }
@@ -99,6 +100,16 @@ def test_compiled_message_is_the_text(name):
     message = compiled(name)
     assert list(message.get_fields_and_field_types().items()) == fields(text)
     assert {key: getattr(message, key) for key in constants(text)} == constants(text)
+
+
+def test_stand_in_is_the_official_message(store):
+    """As `ros2 topic info -v` shows it for /tf of a distribution."""
+    store.register(
+        get_types_from_msg((ROOT / "msg_defs/tf2_msgs/msg/TFMessage.msg").read_text(), "tf2_msgs/msg/TFMessage")
+    )
+    official = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+    assert store.hash_rihs01("tf2_msgs/msg/TFMessage") == official
+    assert (ROOT / "msg_defs/tf2_msgs/COLCON_IGNORE").exists()
 
 
 def test_every_message_text_is_compiled():

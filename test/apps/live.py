@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 import rclpy
 from rclpy.context import Context
@@ -37,6 +38,10 @@ class Process:
     def words(self):
         return self.log.read_text()
 
+    @property
+    def pid(self):
+        return self._process.pid
+
     def alive(self):
         return self._process.poll() is None
 
@@ -53,6 +58,27 @@ class Process:
             except subprocess.TimeoutExpired:
                 os.kill(self._process.pid, signal.SIGALRM)  # its time is over: TERM, then KILL after 5 s
                 self._process.wait(20)
+
+
+@contextmanager
+def bare_node(folder, *arguments):
+    """A node that waits to be configured."""
+    process = Process(folder / "node.log", "node", "--ros-args", *arguments)
+    try:
+        yield process
+    finally:
+        process.kill()
+
+
+def end_child(process):
+    """Kills the process that the node has its map in."""
+    (python,) = _children(process.pid)  # of `timeout`
+    (aligner,) = [pid for pid in _children(python) if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
+    os.kill(aligner, signal.SIGKILL)
+
+
+def _children(pid):
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 @contextmanager
@@ -102,6 +128,16 @@ class Observer:
         publisher = self.node.create_publisher(ros_types(kind), topic, QoSProfile(depth=50, reliability=reliability))
         assert self.until(publisher.get_subscription_count)
         return publisher
+
+    def client(self, name, kind):
+        client = self.node.create_client(ros_types(kind), name)
+        assert self.until(client.service_is_ready), name
+        return client
+
+    def call(self, client, request):
+        future = client.call_async(request)
+        assert self.until(future.done), client.srv_name
+        return future.result()
 
     def until(self, ready, seconds=PATIENCE_S):
         return until(ready, seconds, lambda: self._executor.spin_once(timeout_sec=0.02))

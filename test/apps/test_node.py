@@ -10,13 +10,12 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 pytest.importorskip("xalign_msgs.msg", reason="xalign_msgs is not compiled")
 
 import live
-import rclpy
 from live_world import BETWEEN, FAULTS, LiveWorld, odometry_between, spoiled
 from rclpy.serialization import serialize_message
-from rclpy.signals import SignalHandlerOptions
 
-from xalign_ros.apps.node import Worker, XalignNode
-from xalign_ros.apps.node_parameters import OWN_PARAMETERS, declare_parameters
+from xalign_ros.apps.node_alignment import Alignment, Terms
+from xalign_ros.apps.node_parameters import OWN, declare_parameters
+from xalign_ros.apps.node_worker import Worker
 from xalign_ros.core.aligner import Aligner
 from xalign_ros.core.config import Config, options
 from xalign_ros.core.transforms import SE3
@@ -25,6 +24,7 @@ from xalign_ros.io.messages import KEYFRAME, correction_from_message, keyframe_m
 from xalign_ros.io.odometry_message import ODOMETRY, odometry_pose
 from xalign_ros.io.ros_fields import ros_types
 from xalign_ros.io.step_messages import KEYFRAME_QUEUE, TOPICS
+from xalign_ros.io.xmap import read_map
 
 pytestmark = pytest.mark.ros
 
@@ -41,13 +41,24 @@ def stamps(messages):
 def test_worker_works_in_order_and_drops_the_oldest():
     done = []
     worker = Worker(done.append, lambda: None)
-    assert all(worker.put(n) for n in range(KEYFRAME_QUEUE))
-    assert not worker.put(KEYFRAME_QUEUE)
+    jobs = [b"%d" % n for n in range(KEYFRAME_QUEUE + 1)]
+    assert all(map(worker.put, jobs[:-1]))
+    assert not worker.put(jobs[-1])
+    worker.order(lambda: done.append("first"))
     worker.start()
-    assert live.until(lambda: len(done) == KEYFRAME_QUEUE)
+    assert live.until(lambda: len(done) == 1 + KEYFRAME_QUEUE)
     worker.stop()
-    assert (done, worker.dropped) == (list(range(1, KEYFRAME_QUEUE + 1)), 1)
+    assert (done, worker.dropped) == (["first", *jobs[1:]], 1)
     assert not worker.is_alive()
+
+
+def test_what_waits_for_the_worker_is_bounded_in_bytes(monkeypatch):
+    monkeypatch.setattr("xalign_ros.apps.node_worker.QUEUE_BYTES", 10)
+    worker = Worker(print, print)
+    assert worker.put(b"12345") and worker.put(b"12345") and not worker.put(b"1")
+    assert not worker.put(b"12345678901234") and len(worker) == 1
+    worker.clear()
+    assert worker.put(b"1234567890") and len(worker) == 1
 
 
 def test_worker_beats_and_tells_of_its_end():
@@ -68,16 +79,14 @@ def test_worker_beats_and_tells_of_its_end():
 def test_every_option_is_a_parameter_with_unit_and_range():
     with live.observer() as me:
         declare_parameters(me.node, {})
-        told = {
-            d.name: d for d in me.node.describe_parameters([*OWN_PARAMETERS, *(k for k, _, _ in options(Config()))])
-        }
+        told = {d.name: d for d in me.node.describe_parameters([*OWN, *(k for k, _, _ in options(Config()))])}
         for key, value, leaf in options(Config()):
             d = told[key]
             assert me.node.get_parameter(key).value == value
-            assert d.read_only and leaf.metadata["meaning"] in d.description and leaf.metadata["unit"] in d.description
+            assert leaf.metadata["meaning"] in d.description and leaf.metadata["unit"] in d.description
             (limits,) = d.floating_point_range or d.integer_range
             assert (limits.from_value, limits.to_value) == (leaf.metadata["low"], leaf.metadata["high"])
-        assert all(told[name].description for name in OWN_PARAMETERS)
+        assert all(told[name].description for name in OWN)
 
 
 @pytest.mark.parametrize(
@@ -90,14 +99,32 @@ def test_every_option_is_a_parameter_with_unit_and_range():
         (["window.keyframes:=3.5"], "window.keyframes must be int, not '3.5'"),
         (["pnp.sigma_px:=99"], "pnp.sigma_px = 99.0 is outside 0.05 .. 20"),
         (["base_from_cam:=[1.0, 2.0]"], "must be x y z qx qy qz qw with |q| = 1, not [1.0, 2.0]"),
-        (["qos_overrides./keyframes.subscription.depth:=deep"], "expecting type 'INTEGER'"),
     ],
 )
 def test_bad_map_or_parameter_is_one_sentence(arguments, sentence):
+    refused(arguments, sentence)
+
+
+@pytest.mark.parametrize(
+    ("argument", "sentence"),
+    [
+        ("qos_overrides./keyframes.subscription.depth:=deep", "expecting type 'INTEGER'"),
+        (
+            "qos_overrides./keyframe.subscription.depth:=5",
+            "the nearest is 'qos_overrides./keyframes.subscription.depth'",
+        ),
+    ],
+)
+def test_bad_profile_is_one_sentence(world, argument, sentence):
+    refused([f"map:={world.map}", argument], sentence)
+
+
+def refused(arguments, sentence):
     done = live.xalign("node", "--ros-args", *(word for a in arguments for word in ("-p", a)))
     assert done.returncode == 1, done.stderr
     assert sentence in done.stderr
-    assert done.stderr.startswith("xalign_node: ") and len(done.stderr.splitlines()) == 1
+    told = [line for line in done.stderr.splitlines() if "[INFO]" not in line]
+    assert told[0].startswith("xalign_node: ") and len(told) == 1
 
 
 def test_damaged_map_and_parameter_file_are_one_sentence(world, tmp_path):
@@ -179,19 +206,12 @@ def test_step_that_fails_begins_anew(world, monkeypatch):
         raise ArithmeticError("of the test")
 
     first, second = (bytes(serialize_message(keyframe_message(ros_types, k))) for k in world.run.keyframes[:2])
-    rclpy.init(args=["--ros-args", "-p", f"map:={world.map}"], signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = XalignNode()
-        node.configure()
-        with monkeypatch.context() as m:
-            m.setattr(Aligner, "step", fail)
-            node._take(first)
-        assert (node._state.keyframes, node._state.reason) == (0, "a step failed")
-        node._take(second)
-        assert node._state.keyframes == 1
-        node.stop()
-    finally:
-        rclpy.shutdown()
+    alignment = Alignment(read_map(world.map), Terms(Config()))
+    with monkeypatch.context() as m:
+        m.setattr(Aligner, "step", fail)
+        answer = alignment.take(first, frozenset())
+    assert (answer.state.keyframes, answer.state.reason) == (0, "a step failed") and "of the test" in answer.failure
+    assert alignment.take(second, frozenset()).state.keyframes == 1
 
 
 def test_flood_drops_the_oldest_and_answers_the_newest(world, tmp_path):

@@ -6,55 +6,117 @@ import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
-from xalign_ros.core.config import Config, options, with_options
+from xalign_ros.core.config import Config, option, options, with_options
 from xalign_ros.core.errors import ConfigError
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io.messages import QUAT_TOLERANCE
 from xalign_ros.io.ros_fields import ros_types
 
-OWN_PARAMETERS: dict[str, tuple[Any, str]] = {  # default, description
-    "map": ("", "folder NAME.xmap of the reference map"),
-    "map_frame": ("", "frame of the results; empty: the frame that the map names"),
-    "base_frame": ("", "child frame of odometry_corrected; empty: that of the odometry"),
-    "base_from_cam": ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], "T_base_cam as x y z (m) qx qy qz qw; `pose` is of base"),
-}
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+SEVEN = {"unit": "m", "meaning": "T_base_cam as x y z qx qy qz qw; while it is the identity, /tf_static is asked"}
 
 
-def declare_parameters(node: Node, given: Mapping[str, Any]) -> tuple[Config, dict[str, Any]]:
-    """The options and the own parameters, each declared as what was given for it. Raises ConfigError."""
-    names = [key for key, _, _ in options(Config())]
-    settings = {name: given[name].value for name in names if name in given}
-    config = with_options(Config(), settings, "the node's parameters")
-    descriptor, of_float, of_int = (
-        ros_types(f"rcl_interfaces/msg/{name}")
-        for name in ("ParameterDescriptor", "FloatingPointRange", "IntegerRange")
+@dataclass(frozen=True, slots=True)
+class Live:
+    """What the node itself is told, beside the options of the alignment."""
+
+    map: str = option("", "", "folder NAME.xmap of the reference map")
+    map_folder: str = option("", "", "~/load_map takes maps within this folder alone; empty: the folder `map` is in")
+    map_frame: str = option("", "", "frame of the results; empty: the frame that the map names")
+    base_frame: str = option("", "", "child frame of odometry_corrected; empty: that of the odometry")
+    frame_prefix: str = option("", "", "put before map_frame and base_frame; frames of messages stay as they come")
+    base_from_cam: tuple[float, ...] = field(default=IDENTITY, metadata=SEVEN)
+    autostart: bool = option(True, "", "configure and activate at once; false: wait for a lifecycle manager")
+    publish_tf: bool = option(True, "", "send map -> odom on /tf")
+    tf_smooth: bool = option(False, "", "send the smooth pose's map -> odom instead of the raw one's")
+    tf_rate_hz: float = option(30.0, "Hz", "of /tf", 1.0, 200.0)
+    transform_tolerance_s: float = option(0.1, "s", "how far ahead of the newest odometry /tf is stamped", 0.0, 10.0)
+    smooth_m_s: float = option(0.2, "m/s", "how fast odometry_smooth follows a jump", 0.001, 100.0)
+    smooth_deg_s: float = option(5.0, "deg/s", "the same, of its rotation", 0.01, 1000.0)
+    smooth_snap_m: float = option(3.0, "m", "a jump beyond this is followed at once", 0.0, 1e6)
+    jump_m: float = option(0.3, "m", "a correction beyond this is told on `jumps`", 0.0, 1e6)
+    jump_deg: float = option(5.0, "deg", "the same, of its rotation", 0.0, 180.0)
+    silent_after_s: float = option(
+        5.0, "s", "without a message until an input counts as silent and /tf rests", 0.1, 1e6
     )
-    for key, value, leaf in options(config):
+
+    @property
+    def T_base_cam(self) -> SE3 | None:
+        """None while it is the identity."""
+        return SE3.from_quat(self.base_from_cam[3:], self.base_from_cam[:3]) if self.base_from_cam != IDENTITY else None
+
+    @property
+    def folder(self) -> Path:
+        """That a map may be in."""
+        return Path(self.map_folder or Path(self.map).parent).resolve()
+
+    def map_within(self, path: str) -> Path:
+        """The path, links followed. Raises ConfigError where it leads out of `folder`."""
+        try:
+            found = (self.folder / path).resolve()
+        except (OSError, ValueError, RuntimeError) as error:
+            raise ConfigError(f"'{path[:200]}' is no path: {error}") from error
+        if not found.is_relative_to(self.folder):
+            raise ConfigError(
+                f"{path[:200]} is outside {self.folder}, the folder that maps are taken from (map_folder)"
+            )
+        return found
+
+
+OWN = {f.name: f for f in fields(Live)}
+
+
+def declare_parameters(node: Node, given: Mapping[str, Any]) -> None:
+    """The options and the node's own, each declared as what was given for it. Raises ConfigError."""
+    values = {name: parameter.value for name, parameter in given.items()}
+    config, live = read_parameters(values)
+    kinds = ("ParameterDescriptor", "FloatingPointRange", "IntegerRange")
+    descriptor, of_float, of_int = (ros_types(f"rcl_interfaces/msg/{name}") for name in kinds)
+    own = [(name, getattr(live, name), f) for name, f in OWN.items()]
+    for key, value, leaf in [*options(config), *own]:
         m = leaf.metadata
-        about = descriptor(description=f"{m['meaning']} [{m['unit']}]", read_only=True)
+        about = descriptor(description=f"{m['meaning']} [{m['unit']}]" if m["unit"] else m["meaning"])
+        about.additional_constraints = "takes effect when the node is configured"
         if isinstance(value, float):
             about.floating_point_range = [of_float(from_value=float(m["low"]), to_value=float(m["high"]))]
         elif type(value) is int:
             about.integer_range = [of_int(from_value=int(m["low"]), to_value=int(m["high"]), step=1)]
+        value = list(value) if isinstance(value, tuple) else value
         node.declare_parameter(key, value, about, ignore_override=True)
-    own = {name: given[name].value if name in given else default for name, (default, _) in OWN_PARAMETERS.items()}
-    T_base_cam = extrinsic(own["base_from_cam"])
-    for name, (default, meaning) in OWN_PARAMETERS.items():
-        if isinstance(default, str) and not isinstance(own[name], str):
-            raise ConfigError(f"the parameter '{name}' must be text, not {own[name]}")
-        start = own[name] if isinstance(default, str) else [float(x) for x in own[name]]
-        node.declare_parameter(name, start, descriptor(description=meaning, read_only=True), ignore_override=True)
-    return config, own | {"base_from_cam": T_base_cam}
 
 
-def extrinsic(values: Any) -> SE3 | None:
-    """T_base_cam; None while it is the identity."""
+def read_parameters(values: Mapping[str, Any]) -> tuple[Config, Live]:
+    """From values by name; unknown names are left to `refuse_unknown`. Raises ConfigError."""
+    names = [key for key, _, _ in options(Config())]
+    config = with_options(Config(), {n: values[n] for n in names if n in values}, "the node's parameters")
+    return config, Live(**{name: _own(name, values[name]) for name in OWN if name in values})
+
+
+def _own(name: str, value: Any) -> Any:
+    if name == "base_from_cam":
+        return _extrinsic(value)
+    leaf = OWN[name]
+    assert leaf.default is not MISSING
+    kind, m = type(leaf.default), leaf.metadata
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind:
+        told = {str: "text", bool: "true or false", float: "a number"}[kind]
+        raise ConfigError(f"the parameter '{name}' must be {told}, not {value}")
+    if kind is float and not m["low"] <= value <= m["high"]:
+        raise ConfigError(f"the parameter '{name}' = {value} is outside {m['low']} .. {m['high']}")
+    return value
+
+
+def _extrinsic(values: Any) -> tuple[float, ...]:
     try:
         seven = np.array(values, float)
     except (TypeError, ValueError):
@@ -62,13 +124,13 @@ def extrinsic(values: Any) -> SE3 | None:
     if seven.shape != (7,) or not np.isfinite(seven).all() or abs(np.linalg.norm(seven[3:]) - 1) > QUAT_TOLERANCE:
         told = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else values
         raise ConfigError(f"the parameter 'base_from_cam' must be x y z qx qy qz qw with |q| = 1, not {told}")
-    return SE3.from_quat(seven[3:], seven[:3]) if (seven != OWN_PARAMETERS["base_from_cam"][0]).any() else None
+    return tuple(seven.tolist())
 
 
-def refuse_unknown(node: Node, given: Iterable[str]) -> None:
-    """Once all is declared, those of the endpoints' QoS too. Raises ConfigError naming the nearest known one."""
+def refuse_unknown(node: Node, given: Iterable[str], but: str = "") -> None:
+    """Raises ConfigError naming the nearest known one; names that begin with `but` are not looked at."""
     for name in given:
-        if not node.has_parameter(name):
+        if not node.has_parameter(name) and not (but and name.startswith(but)):
             near = difflib.get_close_matches(name, node.list_parameters([], 0).names, 1, 0.0)[0]
             raise ConfigError(f"there is no parameter '{name}'; the nearest is '{near}'")
 

@@ -7,10 +7,12 @@ from collections import deque
 import numpy as np
 
 from xalign_ros.core.anchor import Sighting, find_guided, find_together, sight
-from xalign_ros.core.belief import Belief, Prediction
+from xalign_ros.core.belief import Belief, Prediction, refused
 from xalign_ros.core.config import Config
-from xalign_ros.core.intake import begins_session, carries_pose, refusal
+from xalign_ros.core.intake import Setback, begins_session, carries_pose, refusal
+from xalign_ros.core.lie import Array
 from xalign_ros.core.odometry import odom_in_map, pose_covariance
+from xalign_ros.core.prior import Hint, Prior
 from xalign_ros.core.records import (
     INPUT_REASONS,
     AlignmentState,
@@ -24,7 +26,7 @@ from xalign_ros.core.records import (
 from xalign_ros.core.reference_map import MapIndex, ReferenceMap
 from xalign_ros.core.smoothing import eased
 from xalign_ros.core.status import score
-from xalign_ros.core.transforms import Sim3
+from xalign_ros.core.transforms import SE3, Sim3
 
 TOGETHER = 5  # keyframes that are looked for at once
 
@@ -38,7 +40,17 @@ class Aligner:
         self.belief = Belief(self.config)
         self._published: Sim3 | None = None  # the last S_map_odom, for a jump to start from
         self._sightings: deque[Sighting] = deque(maxlen=TOGETHER)  # of the newest keyframes, while there is no lock
+        self._hint: Hint | None = None  # given since the last keyframe
+        self._prior: Prior | None = None  # of this session, until its lock
+        self._setback = Setback()
         self._counts = {"keyframes": 0, "accepted": 0, "rejected": 0}
+
+    def hint(self, T_map_cam: SE3, cov_cam: Array) -> None:
+        """Where the next keyframe is, with covariance (6, 6) in camera axes, for its session to look around first.
+
+        Until the lock an anchor that contradicts it is refused. A lock that agrees with it stands, any other is given up.
+        """
+        self._hint = Hint(T_map_cam, cov_cam)
 
     def step(self, keyframe: Keyframe | None, fault: Rejection | None = None) -> Step:
         """Take one keyframe; `fault` is what reading its message found wrong with its features, or with all of it.
@@ -52,17 +64,37 @@ class Aligner:
             return self._step(fault)
         earlier = self.belief.keyframes
         if earlier and begins_session(keyframe, earlier[-1]):
-            self.belief.begin(State.LOST, f"the odometry began session {keyframe.session}")
-            self._published = None
-            self._sightings.clear()
-            earlier = []
-        refused = refusal(keyframe, earlier, self.index.map)
-        if refused is not None and not carries_pose(refused):
-            return self._step(refused)
+            earlier = self._begin(State.LOST, f"the odometry began session {keyframe.session}")
+        elif earlier and self._setback.at(keyframe.stamp_ns, earlier[-1].stamp_ns):
+            earlier = self._begin(State.LOST, "the stamps of the odometry went back, and stayed there")
+        fallen = refusal(keyframe, earlier, self.index.map)
+        if fallen is not None and not carries_pose(fallen):
+            return self._step(fallen)
         predicted = self.belief.extend(keyframe)
-        found = fault or refused or self._find_anchor(keyframe, predicted)
+        if self._hint is not None:
+            predicted = self._take_hint(self._hint, keyframe, predicted)
+        found = fault or fallen or self._find_anchor(keyframe, predicted)
         found, believed = self.belief.judge(found, predicted)
+        if self.belief.estimate is not None:
+            self._prior = None
         return self._step(found, predicted, self._correction(keyframe), believed)
+
+    def _begin(self, state: State, reason: str) -> list[Keyframe]:
+        """Anew, with no keyframe."""
+        self.belief.begin(state, reason)
+        self._published = self._prior = None
+        self._sightings.clear()
+        return []
+
+    def _take_hint(self, hint: Hint, keyframe: Keyframe, predicted: Prediction | None) -> Prediction | None:
+        self._hint = None
+        if predicted is not None:
+            S, cov = predicted
+            if not hint.contradicts(S.rigid_pose(), pose_covariance(S, cov), self.config.lock.chi2):
+                return predicted
+        self._begin(State.UNINITIALIZED, "a pose was given, no anchor was found there yet")
+        self._prior = Prior(hint, keyframe, self.config)
+        return self.belief.extend(keyframe)
 
     def _find_anchor(self, keyframe: Keyframe, predicted: Prediction | None) -> Anchor | Rejection:
         """Guided around the prediction while there is one; over the whole map when not, or when coasting in vain."""
@@ -73,12 +105,23 @@ class Aligner:
             if isinstance(found, Anchor) or state is State.LOCALIZED:
                 self._sightings.clear()
                 return found
+        elif self._prior is not None:
+            given = self._prior.at(keyframe)
+            found = find_guided(keyframe, self.index, given.T_map_cam, given.cov_cam, self.config)
+            if isinstance(found, Anchor) and self._prior.allows(found, keyframe):
+                self._prior = self._prior.moved_to(found, keyframe)
+                return found
         anywhere, sighting = sight(keyframe, self.index, self.config)
+        if self._prior is not None and isinstance(anywhere, Anchor) and not self._prior.allows(anywhere, keyframe):
+            return refused(anywhere, "drift_budget", "it contradicts the pose that was given")
         self._sightings.append(sighting)
         if predicted is not None and state is not State.LOST:
             return anywhere if isinstance(anywhere, Anchor) else found
         if len(self._sightings) >= self.config.lock.anchors:
             together = find_together(tuple(self._sightings), self.index, self.config)
+            if self._prior is not None:
+                where = {s.keyframe.id: s.keyframe for s in self._sightings}
+                together = {k: a for k, a in together.items() if self._prior.allows(a, where[k])}
             self.belief.remember(together)
             return anywhere if isinstance(anywhere, Anchor) else together.get(keyframe.id, anywhere)
         return anywhere

@@ -156,14 +156,14 @@ class Belief:
             return found
         self._links[-1].anchor = found
         if predicted is None or self.judged(pose_covariance(*predicted))[0] is State.LOST:
-            return _refused(found, "inconsistent", WAITS)
+            return refused(found, "inconsistent", WAITS)
         S, cov = predicted
         error = (found.T_map_cam.inverse() @ S.rigid_pose()).log()
         chi2 = float(error @ np.linalg.solve(pose_covariance(S, cov) + found.cov_cam, error))
         if chi2 < self.config.lock.chi2:
             return found
         off = float(np.linalg.norm(error[3:]))
-        return _refused(
+        return refused(
             found, "drift_budget", f"it is {off:.2f} m off the prediction: {chi2:.0f} > {self.config.lock.chi2:g}"
         )
 
@@ -171,7 +171,7 @@ class Belief:
         """Go on without a window where the odometry has leapt further than numbers reach; an anchor waits for others."""
         self._window = self._anchored = None
         self.unlocked = State.LOST, "the odometry leapt further than the window can follow"
-        return _refused(found, "inconsistent", WAITS) if isinstance(found, Anchor) else found
+        return refused(found, "inconsistent", WAITS) if isinstance(found, Anchor) else found
 
     def _challenge(self, found: Rejection) -> tuple[Anchor | Rejection, tuple[Anchor, ...]]:
         """Find the newest waiting anchor's party, and let it take over if it may."""
@@ -236,6 +236,6 @@ def _witnesses(links: Sequence[_Link]) -> list[Witness]:
     return [Witness(link.anchor, link.keyframe.T_odom_cam, link.path) for link in links if link.anchor]
 
 
-def _refused(anchor: Anchor, reason: str, detail: str) -> Rejection:
+def refused(anchor: Anchor, reason: str, detail: str) -> Rejection:
     who = (anchor.keyframe_id, anchor.session, anchor.stamp_ns)
     return Rejection(*who, reason, detail, anchor.matches, anchor.inliers, anchor.rms_px, anchor.runner_up, anchor)

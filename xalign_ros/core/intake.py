@@ -12,6 +12,7 @@ from xalign_ros.core.transforms import SE3
 
 BORDER_PX = 1.0  # a detector's sub-pixel refinement may step over the edge
 ROTATION_TOLERANCE = 1e-6
+SETBACK_NS, SETBACK_IN_A_ROW = 1_000_000_000, 5  # behind the newest, so many in a row: late messages are not that
 
 
 def refusal(keyframe: Keyframe, earlier: Sequence[Keyframe], map_: ReferenceMap) -> Rejection | None:
@@ -72,6 +73,24 @@ def begins_session(keyframe: Keyframe, last: Keyframe) -> bool:
     if keyframe.session == last.session or _pose_fault(keyframe.T_odom_cam):
         return False
     return keyframe.session > last.session or keyframe.stamp_ns > last.stamp_ns
+
+
+class Setback:
+    """A source whose stamps went back for good, as those of a log that is played again do."""
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+
+    def at(self, stamp_ns: int, last_ns: int) -> bool:
+        """Whether this stamp, behind `last_ns` like the rising ones just before it, makes the source begin anew."""
+        if last_ns - stamp_ns < SETBACK_NS or (self._stamps and stamp_ns <= self._stamps[-1]):
+            self._stamps = []
+        if last_ns - stamp_ns >= SETBACK_NS:
+            self._stamps.append(stamp_ns)
+        if len(self._stamps) < SETBACK_IN_A_ROW:
+            return False
+        self._stamps = []
+        return True
 
 
 def carries_pose(rejection: Rejection) -> bool:

@@ -47,17 +47,23 @@ def step_size(T_i_j: SE3) -> tuple[float, float]:
     return float(np.linalg.norm(T_i_j.t)), float(np.arccos(np.clip((np.trace(T_i_j.R) - 1) / 2, -1, 1)))
 
 
+def leaps(step: tuple[float, float], earlier: Sequence[tuple[float, float]], scale: float) -> bool:
+    """Whether a `step_size` is out of all proportion to the `earlier` ones; of too few nothing can be said."""
+    length, angle = step
+    if (length <= LEAP_M / scale and angle <= LEAP_RAD) or len(earlier) < 3:
+        return False
+    usual = np.sort(earlier, axis=0)[-2]
+    return bool(length > max(LEAP_RATIO * usual[0], LEAP_M / scale) or angle > max(LEAP_RATIO * usual[1], LEAP_RAD))
+
+
 def with_leap(edge: RelativePose, earlier: Sequence[tuple[float, float]], scale: float) -> RelativePose:
     """The edge, or, where its step is out of all proportion to the `earlier` ones, one that says next to nothing.
 
     An odometry that lost its tracks leaps, by an amount that is no measurement: its sigmas are raised to that amount. What
     is usual is the second largest step, so that one leap does not hide the next, and a robot that drives off does.
     """
-    if len(earlier) < 3:
-        return edge
     length, angle = step_size(edge.T_i_j)
-    usual = np.sort(earlier, axis=0)[-2]
-    if length <= max(LEAP_RATIO * usual[0], LEAP_M / scale) and angle <= max(LEAP_RATIO * usual[1], LEAP_RAD):
+    if not leaps((length, angle), earlier, scale):
         return edge
     return RelativePose(edge.i, edge.j, edge.T_i_j, np.maximum(edge.sigmas, np.r_[[angle] * 3, [length] * 3, 0.0]))
 
