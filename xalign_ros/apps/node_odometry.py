@@ -22,6 +22,7 @@ from xalign_ros.io.ros_fields import ros_types, stamp_of
 
 STEPS = 10  # of the odometry that say what a step of it is like
 EXTRAPOLATED_S = 1.0  # beyond the stamp of a keyframe at most
+ARRIVED = 1e-9  # entries of two poses that are the same but for rounding
 SCALED = "{}_scaled"  # frame of the rescaled odometry
 
 
@@ -128,6 +129,8 @@ class OdometryCorrector:
         return _Moment(stamp_ns, answer, carrier, T_odom, T_map, smooth, last.scaled @ moved, cov)
 
     def _slewed(self, here: SE3, there: SE3, seconds: float) -> SE3:
+        if np.abs(here.matrix() - there.matrix()).max() < ARRIVED:
+            return there
         twist = (here.inverse() @ there).log()
         angle, way = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
         if way > self._slew.snap_m:
