@@ -12,6 +12,8 @@ CAMERAS = {
     "radtan4": Camera("radtan", K, [-0.28, 0.07, 1e-3, -2e-3], 640, 480),
     "radtan5": Camera("radtan", K, [0.12, -0.25, 1e-3, 5e-4, 0.1], 640, 480),
     "radtan8": Camera("radtan", K, [0.9, 0.4, 1e-4, 2e-4, 0.05, 1.2, 0.5, 0.1], 640, 480),
+    "radtan12": Camera("radtan", K, [0.9, 0.4, 1e-4, 2e-4, 0.05, 1.2, 0.5, 0.1, 2e-3, -1e-3, -3e-3, 2e-3], 640, 480),
+    "radtan14": Camera("radtan", K, [-0.2, 0.05, 1e-3, 2e-3, 0, 0, 0, 0, 0, 0, 0, 0, 0.02, -0.03], 640, 480),
     "equidistant": Camera("equidistant", K, [-0.01, 0.02, -0.008, 0.001], 640, 480),
     "fov": Camera("fov", K, [0.9], 640, 480),
     "division": Camera("division", K, [-0.12], 640, 480),
@@ -20,9 +22,30 @@ CAMERAS = {
     "eucm below a half": Camera("eucm", K, [0.3, 0.9], 640, 480),
     "double_sphere": Camera("double_sphere", K, [-0.18, 0.59], 640, 480),
     "double_sphere below a half": Camera("double_sphere", K, [0.1, 0.4], 640, 480),
+    "omni": Camera("omni", K * [2, 2, 1, 1], [0.8, -0.15, 0.03, 1e-3, -2e-3], 640, 480),
+    "omni of a convex mirror": Camera("omni", K * [3, 3, 1, 1], [1.7, 0.2, 0.1, -1e-3, 5e-4], 640, 480),
+    "thin_prism_fisheye": Camera(
+        "thin_prism_fisheye", K, [-0.05, 0.02, 1e-3, -2e-3, 4e-3, -1e-3, 2e-3, -3e-3], 640, 480
+    ),
+    "radtan_thin_prism_fisheye": Camera(
+        "radtan_thin_prism_fisheye",
+        K,
+        [0.3, -0.2, 0.1, 0.05, -0.03, 0.004, 1e-3, -2e-3, 2e-3, 1e-3, -1e-3, 5e-4],
+        640,
+        480,
+    ),
+    "equirectangular": Camera("equirectangular", K, [], 640, 480),
 }
 every = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-FISHEYES = {"equidistant": [0, 0, 0, 0], "fov": [0.9], "eucm": [0.62, 1.08], "double_sphere": [-0.18, 0.59]}
+FISHEYES = {
+    "equidistant": [0, 0, 0, 0],
+    "fov": [0.9],
+    "eucm": [0.62, 1.08],
+    "double_sphere": [-0.18, 0.59],
+    "omni": [1.2, -0.03, 0.002, 1e-3, -2e-3],
+    "thin_prism_fisheye": [-0.01, 0.004, 1e-3, -2e-3, 0, 0, 2e-3, -3e-3],
+    "radtan_thin_prism_fisheye": [0.01, -0.002, 0, 0, 0, 0, 1e-3, -2e-3, 1e-3, 1e-4, -2e-3, 1e-4],
+}
 
 
 def on_image(camera, n=400, seed=0):
@@ -39,7 +62,7 @@ def matrix():
     return np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
 
 
-@pytest.mark.parametrize("name", ["pinhole", "radtan4", "radtan5", "radtan8"])
+@pytest.mark.parametrize("name", ["pinhole", "radtan4", "radtan5", "radtan8", "radtan12", "radtan14"])
 def test_radtan_against_opencv(name):
     camera = CAMERAS[name]
     x, uv = on_image(camera)
@@ -97,8 +120,9 @@ def test_project_undoes_unproject_over_the_whole_image(camera):
     np.testing.assert_allclose(back, uv[valid], atol=1e-9 * K[0])
 
 
-def test_unproject_against_opencv():
-    camera = CAMERAS["radtan5"]
+@pytest.mark.parametrize("name", ["radtan5", "radtan12", "radtan14"])
+def test_unproject_against_opencv(name):
+    camera = CAMERAS[name]
     _, uv = on_image(camera)
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
     want = cv2.undistortPoints(uv[:, None], matrix(), camera.D, criteria=stop).reshape(-1, 2)
@@ -156,10 +180,65 @@ def test_where_a_spherical_model_ends():
     assert camera.unproject(np.column_stack([far, [K[3], K[3]]]))[1].tolist() == [True, False]
 
 
+@pytest.mark.parametrize("name", ["omni", "omni of a convex mirror"])
+def test_omni_against_its_formula(name):
+    """Mei and Rives, section II: on the unit sphere, moved along z by xi, into the plane, distorted there."""
+    camera = CAMERAS[name]
+    x, uv = on_image(camera)
+    xi, k1, k2, p1, p2 = camera.D
+    sphere = x / np.linalg.norm(x, axis=1, keepdims=True)
+    u, v = (sphere[:, :2] / (sphere[:, 2:] + xi)).T
+    rho2 = u * u + v * v
+    radial = 1 + k1 * rho2 + k2 * rho2**2
+    distorted = np.stack(
+        [u * radial + 2 * p1 * u * v + p2 * (rho2 + 2 * u * u), v * radial + p1 * (rho2 + 2 * v * v) + 2 * p2 * u * v],
+        1,
+    )
+    np.testing.assert_allclose(uv, camera.K[:2] * distorted + camera.K[2:], atol=1e-9)
+
+
+def test_omni_without_distortion_is_the_unified_model():
+    """With alpha = xi / (1 + xi) and the focal length over 1 + xi it is EUCM with beta = 1."""
+    xi = 1.4
+    eucm = Camera("eucm", K, [xi / (1 + xi), 1.0], 640, 480)
+    omni = Camera("omni", K * [1 + xi, 1 + xi, 1, 1], [xi, 0, 0, 0, 0], 640, 480)
+    x, uv = on_image(eucm)
+    np.testing.assert_allclose(omni.project(x)[0], uv, atol=1e-9)
+    np.testing.assert_allclose(omni.unproject(uv)[0], eucm.unproject(uv)[0], atol=1e-12)
+
+
+def panorama(width=800):
+    f = width / (2 * np.pi)
+    return Camera("equirectangular", [f, f, (width - 1) / 2, (width / 2 - 1) / 2], [], width, width // 2)
+
+
+def test_a_panorama_sees_all_directions_but_the_poles():
+    camera = panorama()
+    x = np.random.default_rng(0).normal(size=(500, 3))
+    uv, valid, J = camera.project_with_jacobian(x)
+    assert valid.all() and camera.inside(uv).all() and np.isfinite(J).all()
+    rays, back = camera.unproject(uv)
+    assert back.all()
+    np.testing.assert_allclose(rays, x / np.linalg.norm(x, axis=1, keepdims=True), atol=1e-12)
+    assert not camera.project([[0, 2.0, 0], [0, -1, 0], [0, 0, 0]])[1].any()  # of any column there
+
+
+def test_a_panorama_by_hand():
+    """Right of ahead is right, down is low; the two ends of a row meet behind."""
+    uv, valid = panorama().project([[0, 0, 1], [1, 0, 0], [0, 1, 1], [-1e-9, 0, -1], [1e-9, 0, -1]])
+    assert valid.all()
+    np.testing.assert_allclose(
+        uv, [[399.5, 199.5], [599.5, 199.5], [399.5, 299.5], [-0.5, 199.5], [799.5, 199.5]], atol=1e-6
+    )
+    rays, valid = panorama().unproject([[-0.5, 199.5], [799.5, 199.5], [-2, 100], [100, 400]])
+    assert valid.tolist() == [True, True, False, False]
+    np.testing.assert_allclose(rays[:2], [[0, 0, -1], [0, 0, -1]], atol=1e-12)
+
+
 # Where a model ends -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("name", sorted(set(CAMERAS) - {"equirectangular"}))
 def test_behind_the_camera_is_invalid_and_nan(name):
     camera = CAMERAS[name]
     x = np.array([[0.1, 0.2, -2.0], [0, 0, -1.0], [0, 0, 0], [np.nan, 0, 1], [0.1, 0.2, 2.0]])
@@ -208,6 +287,22 @@ def test_beyond_the_fold_of_a_fisheye_nothing_is_valid():
     assert camera.unproject([[top - 1, K[3]], [top + 1, K[3]]])[1].tolist() == [True, False]
 
 
+def test_beyond_the_turn_of_a_division_nothing_is_valid():
+    """r = r_d / (1 + k r_d^2) has its largest at r_d = 1 / sqrt(k); a pixel beyond is of no ray."""
+    camera = Camera("division", K, [0.25], 640, 480)
+    turn = K[2] + 2 * K[0]
+    assert camera.unproject([[turn - 1, K[3]], [turn + 1, K[3]]])[1].tolist() == [True, False]
+
+
+def test_nothing_is_valid_beyond_a_narrow_pole():
+    """1 - 0.454 r^2 + ... has a root at 1.3, the numerator one just beside it: between them lies all that turns back."""
+    camera = Camera("radtan", K, [-0.247, 0.017, 0, 0, -0.118, -0.454, 0.014, -0.06], 640, 480)
+    root = np.sqrt(np.roots([-0.06, 0.014, -0.454, 1])[-1].real)
+    assert camera.limit < root
+    rays, valid = camera.unproject([[K[2] + 420 * 1.2, K[3]]])
+    assert valid[0] and rays[0, 0] / rays[0, 2] < root
+
+
 def test_beyond_the_half_circle_of_fov_nothing_is_valid():
     camera = CAMERAS["fov"]
     edge = K[2] + K[0] * np.pi / 0.9
@@ -237,7 +332,7 @@ def test_pixels_that_are_no_numbers_are_invalid():
     [
         (
             {"model": "brown"},
-            "camera model 'brown' is not one of radtan, equidistant, fov, eucm, double_sphere, division",
+            "camera model 'brown' is not one of radtan, equidistant, fov, eucm, double_sphere, division, omni",
         ),
         ({"D": [0.1, 0.2, 0.3]}, "radtan takes"),
         ({"model": "equidistant", "D": [0.1]}, "equidistant takes"),
@@ -257,6 +352,8 @@ def test_pixels_that_are_no_numbers_are_invalid():
         ({"model": "eucm", "D": [0.5, 0.0]}, "beta above 0"),
         ({"model": "double_sphere", "D": [-1.0, 0.5]}, "xi in -1..1"),
         ({"model": "double_sphere", "D": [0.1, -0.1]}, "alpha in 0..1"),
+        ({"model": "omni", "D": [-0.1, 0, 0, 0, 0]}, "xi from 0 on"),
+        ({"model": "equirectangular", "D": [0.1]}, "equirectangular takes"),
     ],
 )
 def test_what_cannot_be_a_camera_is_an_error(change, words):

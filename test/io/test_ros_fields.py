@@ -115,7 +115,7 @@ BAD_CAMERAS = [
     ("camera.k", [400, 0, 320, 0, float("nan"), 240, 0, 0, 1], "no usable intrinsics"),
     ("camera.k", [-400, 0, 320, 0, 410, 240, 0, 0, 1], "no usable intrinsics"),
     ("camera.k", [400, 5, 320, 0, 410, 240, 0, 0, 1], "skew"),
-    ("camera.d", np.ones(12), "coefficients"),
+    ("camera.d", np.ones(15), "coefficients"),
     ("camera.d", [np.nan] * 5, "no usable intrinsics"),
 ]
 
@@ -135,7 +135,7 @@ def test_fov_with_zero_angle_is_no_camera():
 
 
 @pytest.mark.parametrize(
-    ("D", "length"), [([0.1, 0.01], 4), ([0.1, 0, 0, 0, 0.2, 0], 5), ([0.0] * 14, 0), ([0.1] * 7, 8)]
+    ("D", "length"), [([0.1, 0.01], 4), ([0.1, 0, 0, 0, 0.2, 0], 5), ([0.0] * 16, 0), ([0.1] * 7, 8)]
 )
 def test_missing_and_extra_zeros_of_distortion_do_not_matter(D, length):
     keyframe, rejection = broken("camera.d", D)
