@@ -27,7 +27,8 @@ CONVERGED = 1e-8  # relative decrease of the cost
 class Bundled:
     """The adjusted reconstruction, half the sum of squared whitened residuals before and after, and how it went.
 
-    skipped: observations that took no part, since their point was behind the camera or beyond its model at the start.
+    skipped: observations that took no part, since their point was behind the camera or beyond its model at the start,
+    and those that ended there, whose cost is that of an error across the image.
     """
 
     reconstruction: Reconstruction
@@ -88,7 +89,7 @@ def adjust(
     points = np.empty_like(X)
     points[problem.order] = X
     adjusted = replace(reconstruction, R=project_rotation(R), t=t, points=points)
-    m, skipped = len(problem.uv), problem.skipped
+    m, skipped = len(problem.uv), problem.skipped + problem.lost_at(R, t, X)
     return Bundled(adjusted, float(initial), float(cost), iterations, converged, m, skipped)
 
 
@@ -144,6 +145,9 @@ class _Problem:
     def _take(self, r: Reconstruction, rows: np.ndarray, track: np.ndarray, camera: np.ndarray) -> None:
         self.view, self.track, self.uv = r.observing_views[rows].astype(np.int64), track[rows], r.uv[rows]
         self.whitener = None if r.sigma_px is None else 1 / r.sigma_px[rows]
+        size = np.array([(c.width, c.height) for c in r.cameras], float).reshape(-1, 2)
+        span = np.linalg.norm(size.max(axis=0)) / np.sqrt(2) if len(size) else 0.0
+        self.lost = span * (1.0 if self.whitener is None else float(self.whitener.max(initial=0.0)))
         self.by_camera = [(c, np.flatnonzero(camera[self.view] == k)) for k, c in enumerate(r.cameras)]
 
     def _local(self, R: Array, t: Array, X: Array) -> Array:
@@ -158,9 +162,15 @@ class _Problem:
         r -= self.uv
         return r if self.whitener is None else np.asarray(r * self.whitener)
 
+    def lost_at(self, R: Array, t: Array, X: Array) -> int:
+        """Observations without a projection."""
+        return int((~np.isfinite(self._project(R, t, X)).all(axis=1)).sum())
+
     def cost(self, R: Array, t: Array, X: Array) -> float:
-        """Infinite where an observation has no projection."""
+        """An observation that has lost its projection on the way costs as much as one at the image's other end."""
         r = self._project(R, t, X)
+        lost = ~np.isfinite(r).all(axis=1)
+        r[lost] = self.lost
         total = _cost(r, self.loss) + sum(_cost(e, loss) for (e, _), loss in self._others(R, t))
         return total if np.isfinite(total) else np.inf
 
@@ -171,6 +181,8 @@ class _Problem:
             at = slice(None) if len(mine) == m else mine
             r[at], _, J[at] = camera.project_with_jacobian(x[at])
         r -= self.uv
+        lost = ~np.isfinite(r).all(axis=1)
+        r[lost], J[lost] = 0.0, 0.0
         if self.whitener is not None:
             r, J = r * self.whitener, J * self.whitener[:, :, None]
         if self.loss.name != "none":
