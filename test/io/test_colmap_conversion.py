@@ -7,16 +7,24 @@ import pytest
 from colmap_samples import tiny_model
 from reconstruction_samples import CAMERAS, assert_same, sample
 
+from xalign_ros.core.camera import Camera
 from xalign_ros.core.reconstruction import Reconstruction
 from xalign_ros.io.colmap import read_model, write_model
 from xalign_ros.io.colmap_conversion import model_of_reconstruction, reconstruction_of_model
 
+K = np.array([400.0, 410, 320, 240])
+LENSES = (
+    Camera("radtan", K, np.r_[0.1, -0.02, 1e-3, 2e-3, 0.01, 0.2, 0.03, 4e-3], 640, 480),
+    Camera("thin_prism_fisheye", K, np.arange(1, 9) * 1e-3, 640, 480),
+    Camera("radtan_thin_prism_fisheye", K, np.arange(1, 13) * 1e-3, 640, 480),
+    Camera("equirectangular", np.array([640 / (2 * np.pi), 320 / np.pi, 319.5, 159.5]), np.zeros(0), 640, 320),
+)
 STAYS = ("stamps_ns", "priors", "gravity", "sigma_px", "descriptors")  # what COLMAP has no place for
 
 
 def of_colmap(seed) -> Reconstruction:
     """What COLMAP can hold: all estimated, a camera each."""
-    cameras = tuple(c for c in CAMERAS if c.model != "double_sphere" and len(c.D) != 5)
+    cameras = tuple(c for c in CAMERAS if c.model != "double_sphere" and len(c.D) != 5) + LENSES
     r = sample(seed, (*cameras, cameras[0]))
     v = len(r.names)
     nothing = dict.fromkeys(STAYS)

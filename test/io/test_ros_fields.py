@@ -86,11 +86,21 @@ CAMERAS = [
     ("radtan", [0.1, -0.02, 1e-3, 1e-3], "plumb_bob"),
     ("radtan", [0.1, -0.02, 1e-3, 1e-3, 0.01], "plumb_bob"),
     ("radtan", [0.1, -0.02, 1e-3, 1e-3, 0.01, 0.2, 0.01, 0.001], "rational_polynomial"),
+    ("radtan", [0.1, -0.02, 1e-3, 1e-3, 0.01, 0.2, 0.01, 0.001, 1e-3, 0, 0, 2e-3], "rational_polynomial"),
+    ("radtan", [0.1, -0.02, 1e-3, 1e-3, 0.01, 0.2, 0.01, 0.001, 0, 0, 0, 0, 0.02, 0.03], "rational_polynomial"),
     ("equidistant", [0.01, 0.002, 0.0, 0.0], "equidistant"),
     ("fov", [0.92], "fov"),
     ("eucm", [0.62, 1.08], "eucm"),
     ("double_sphere", [-0.18, 0.59], "double_sphere"),
     ("division", [-0.12], "division"),
+    ("omni", [1.2, -0.1, 0.01, 1e-3, 2e-3], "omni"),
+    ("thin_prism_fisheye", [0.1, -0.02, 1e-3, 1e-3, 0.01, 0.02, 1e-3, 2e-3], "thin_prism_fisheye"),
+    (
+        "radtan_thin_prism_fisheye",
+        [0.1, -0.02, 0.01, 0.02, 1e-3, 1e-4, 1e-3, 2e-3, 1e-3, 2e-3, 3e-3, 4e-3],
+        "radtan_thin_prism_fisheye",
+    ),
+    ("equirectangular", [], "equirectangular"),
 ]
 
 

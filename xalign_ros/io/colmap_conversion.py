@@ -7,7 +7,7 @@ import numpy as np
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.reconstruction import Reconstruction
 from xalign_ros.io.colmap_reconstruction import camera_from_colmap
-from xalign_ros.io.colmap_records import ColmapCamera, ColmapImage, ColmapModel, ColmapPoints
+from xalign_ros.io.colmap_records import HALF_PX, ColmapCamera, ColmapImage, ColmapModel, ColmapPoints
 
 
 def reconstruction_of_model(model: ColmapModel) -> Reconstruction:
@@ -86,13 +86,24 @@ def model_of_reconstruction(r: Reconstruction) -> ColmapModel:
 
 
 def _colmap_camera(number: int, camera: Camera) -> ColmapCamera:
-    names = {"equidistant": "OPENCV_FISHEYE", "fov": "FOV", "eucm": "EUCM", "division": "DIVISION"}
+    names = {
+        "equidistant": "OPENCV_FISHEYE",
+        "fov": "FOV",
+        "eucm": "EUCM",
+        "division": "DIVISION",
+        "thin_prism_fisheye": "THIN_PRISM_FISHEYE",
+        "radtan_thin_prism_fisheye": "RAD_TAN_THIN_PRISM_FISHEYE",
+    }
     D = camera.D
-    if camera.model == "radtan":
+    if camera.model == "radtan" and not D[8:].any():
+        D = D[:8]
         name = {0: "PINHOLE", 4: "OPENCV"}.get(len(D), "FULL_OPENCV")
         D = np.r_[D, np.zeros(3)] if len(D) == 5 else D
     elif camera.model in names:
         name = names[camera.model]
+    elif camera.model == "equirectangular" and np.allclose(camera.K[2:] + HALF_PX, camera.K[:2] * [np.pi, np.pi / 2]):
+        size = camera.K[:2] * [2 * np.pi, np.pi]
+        return ColmapCamera(number, "EQUIRECTANGULAR", camera.width, camera.height, size)
     else:
-        raise ValueError(f"COLMAP has no {camera.model} camera")
+        raise ValueError(f"COLMAP has no {camera.model} camera with D = {D.tolist()}")
     return ColmapCamera(number, name, camera.width, camera.height, np.r_[camera.K, D])

@@ -20,7 +20,7 @@ from xalign_ros.core.records import Norm
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io.colmap import read_model
 from xalign_ros.io.colmap_database import read_database, read_descriptor_names
-from xalign_ros.io.colmap_records import CAMERA_PARAMS, ColmapCamera, ColmapImage, ColmapModel, Ints
+from xalign_ros.io.colmap_records import CAMERA_PARAMS, HALF_PX, ColmapCamera, ColmapImage, ColmapModel, Ints
 
 SAME_PX = 0.01  # text models are often written with six digits, and databases hold float32
 SIFT_BYTES = 128
@@ -42,6 +42,9 @@ _OURS = {
     "SIMPLE_DIVISION": ("division", ("k",)),
     "DIVISION": ("division", ("k",)),
     "EUCM": ("eucm", ("alpha", "beta")),
+    "THIN_PRISM_FISHEYE": ("thin_prism_fisheye", CAMERA_PARAMS["THIN_PRISM_FISHEYE"][4:]),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ("radtan_thin_prism_fisheye", CAMERA_PARAMS["RAD_TAN_THIN_PRISM_FISHEYE"][4:]),
+    "EQUIRECTANGULAR": ("equirectangular", ()),
 }
 
 
@@ -116,6 +119,9 @@ def camera_from_colmap(camera: ColmapCamera) -> Camera:
         model, D = (model, D) if D[0] > 0 else ("radtan", [])
         if D and D[0] >= np.pi:
             raise ValueError(f"a field of view of {D[0]:g} rad is not possible")
+    if model == "equirectangular":  # the sphere over w x h
+        w, h = value["w"], value["h"]
+        value = {"fx": w / (2 * np.pi), "fy": h / np.pi, "cx": w / 2 - HALF_PX, "cy": h / 2 - HALF_PX}
     K = [value.get("fx", value.get("f")), value.get("fy", value.get("f")), value["cx"], value["cy"]]
     return Camera(model, np.array(K), np.array(D), camera.width, camera.height)
 

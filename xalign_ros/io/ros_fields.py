@@ -34,6 +34,10 @@ DISTORTION_MODELS = {
     "eucm": "eucm",
     "double_sphere": "double_sphere",
     "division": "division",
+    "omni": "omni",
+    "thin_prism_fisheye": "thin_prism_fisheye",
+    "radtan_thin_prism_fisheye": "radtan_thin_prism_fisheye",
+    "equirectangular": "equirectangular",
 }
 SECOND_NS = 1_000_000_000
 
@@ -179,7 +183,7 @@ def camera_info(types: Types, camera: Camera | None, stamped: Any) -> Any:
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         model = camera.model
         if model == "radtan":
-            model = "rational_polynomial" if len(D) == 8 else "plumb_bob"
+            model = "rational_polynomial" if len(D) >= 8 else "plumb_bob"
     roi = types("sensor_msgs/msg/RegionOfInterest")
     return make(
         header=stamped,
