@@ -317,7 +317,7 @@ def test_no_points_are_no_error(camera):
     assert (rays.shape, valid.shape) == ((0, 3), (0,))
 
 
-@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+@pytest.mark.filterwarnings("error")
 def test_pixels_that_are_no_numbers_are_invalid():
     for camera in CAMERAS.values():
         rays, valid = camera.unproject([[np.nan, 3], [10, np.inf], [300, 200]])

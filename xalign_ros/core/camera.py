@@ -126,7 +126,8 @@ class Camera:
             rays, valid = _direction(m)
         else:
             a, found = (m, np.asarray(True)) if self.plane is None else self.plane.undistort(m)
-            rays, valid = self._ray(a, found)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                rays, valid = self._ray(a, found)
         valid = valid & np.isfinite(rays).all(axis=1)
         rays[~valid] = np.nan
         return rays, valid
@@ -138,8 +139,7 @@ class Camera:
         else:
             q = np.linalg.norm(a, axis=1)
             angle, reached = angle_of(lens, D, q, self.limit)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                k = np.where(q > 1e-12, np.sin(angle) / q, 1.0)
+            k = np.where(q > 1e-12, np.sin(angle) / q, 1.0)
             rays, valid = np.column_stack([a * k[:, None], np.cos(angle)]), valid & reached
         return rays / np.linalg.norm(rays, axis=1, keepdims=True), valid
 
