@@ -152,3 +152,31 @@ def add_features(
         if row is not None:
             db.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * (len(row) + 1))})", (k, *row))
     db.commit()
+
+
+VALUES = dict(f=400.0, fx=410.0, fy=395.0, cx=318.25, cy=243.5, omega=0.9, k=-0.07, p1=0.004, p2=-0.003)
+VALUES |= dict(
+    k1=-0.09,
+    k2=0.031,
+    k3=-0.007,
+    k4=0.012,
+    k5=-0.021,
+    k6=0.005,
+    alpha=0.62,
+    beta=1.08,
+    k0=0.06,
+    p0=-0.002,
+    s0=0.003,
+    s1=-0.002,
+    s2=0.005,
+    s3=-0.004,
+    sx1=0.006,
+    sy1=-0.005,
+    w=640,
+    h=480,
+)  # each different: order shows
+
+
+def lens(model: str, **change: float) -> ColmapCamera:
+    values = VALUES | change
+    return ColmapCamera(1, model, 640, 480, np.array([values[name] for name in CAMERA_PARAMS[model]]))

@@ -1,4 +1,4 @@
-"""A COLMAP model and its database as one reconstruction: lenses against COLMAP's own, frames, refusals, a map of it."""
+"""A COLMAP model and its database as one reconstruction: frames, refusals, a map of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from colmap_samples import assert_one_sentence
+from colmap_samples import assert_one_sentence, lens
 from colmap_world import CAMERAS, COUNT, S_MAP_REFMAP, SIGMA_PX, World, room, write_database
 
 from xalign_ros.core.anchor import find_anywhere
@@ -27,52 +27,11 @@ from xalign_ros.core.reference_map import MapIndex
 from xalign_ros.core.similarity import fit_similarity
 from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.io.colmap import read_model, write_model
-from xalign_ros.io.colmap_reconstruction import camera_from_colmap, read_colmap_reconstruction
-from xalign_ros.io.colmap_records import CAMERA_PARAMS, ColmapCamera, ColmapImage, ColmapModel, ColmapPoints
+from xalign_ros.io.colmap_reconstruction import read_colmap_reconstruction
+from xalign_ros.io.colmap_records import ColmapCamera, ColmapImage, ColmapModel, ColmapPoints
 
 ROOT = Path(__file__).parents[2]
 LUND_DOOR = Path(os.environ.get("XALIGN_DATA", ROOT / "../shared/data")) / "lund_door"
-LENSES = {
-    "SIMPLE_PINHOLE": "radtan",
-    "PINHOLE": "radtan",
-    "SIMPLE_RADIAL": "radtan",
-    "RADIAL": "radtan",
-    "OPENCV": "radtan",
-    "FULL_OPENCV": "radtan",
-    "SIMPLE_FISHEYE": "equidistant",
-    "FISHEYE": "equidistant",
-    "SIMPLE_RADIAL_FISHEYE": "equidistant",
-    "RADIAL_FISHEYE": "equidistant",
-    "OPENCV_FISHEYE": "equidistant",
-    "FOV": "fov",
-    "SIMPLE_DIVISION": "division",
-    "DIVISION": "division",
-    "EUCM": "eucm",
-    "THIN_PRISM_FISHEYE": "thin_prism_fisheye",
-    "RAD_TAN_THIN_PRISM_FISHEYE": "radtan_thin_prism_fisheye",
-    "EQUIRECTANGULAR": "equirectangular",
-}
-VALUES = dict(f=400.0, fx=410.0, fy=395.0, cx=318.25, cy=243.5, omega=0.9, k=-0.07, p1=0.004, p2=-0.003)
-VALUES |= dict(
-    k1=-0.09,
-    k2=0.031,
-    k3=-0.007,
-    k4=0.012,
-    k5=-0.021,
-    k6=0.005,
-    alpha=0.62,
-    beta=1.08,
-    k0=0.06,
-    p0=-0.002,
-    s0=0.003,
-    s1=-0.002,
-    s2=0.005,
-    s3=-0.004,
-    sx1=0.006,
-    sy1=-0.005,
-    w=640,
-    h=480,
-)  # each different: order shows
 
 
 @pytest.fixture(scope="module")
@@ -88,61 +47,6 @@ def folder(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_model(world.model, folder / "txt", binary=False)
     write_database(folder / "database.db", world.model, world.descriptors)
     return folder
-
-
-# --- lenses
-
-
-def lens(model: str, **change: float) -> ColmapCamera:
-    values = VALUES | change
-    return ColmapCamera(1, model, 640, 480, np.array([values[name] for name in CAMERA_PARAMS[model]]))
-
-
-def assert_colmap_projects_alike(camera: ColmapCamera, tolerance_px: float = 1e-9) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
-    half = [0.5 * (name in ("cx", "cy")) for name in CAMERA_PARAMS[camera.model]]
-    theirs = pycolmap.Camera(model=camera.model, width=640, height=480, params=camera.params + half)
-    rng = np.random.default_rng(0)
-    x_cam = np.vstack([[0, 0, 1], np.column_stack([rng.uniform(-1, 1, (300, 2)), rng.uniform(1, 4, 300)])])
-    ours = camera_from_colmap(camera)
-    uv, valid = ours.project(x_cam)
-    assert valid.all()
-    np.testing.assert_allclose(uv + 0.5, theirs.img_from_cam(x_cam), rtol=0, atol=tolerance_px)
-    ray, valid = ours.unproject(theirs.img_from_cam(x_cam) - 0.5)
-    assert valid.all()
-    np.testing.assert_allclose(ray[:, :2] / ray[:, 2:], x_cam[:, :2] / x_cam[:, 2:], rtol=0, atol=1e-3 * tolerance_px)
-
-
-@pytest.mark.parametrize(("model", "ours"), LENSES.items())
-def test_camera_is_colmaps(model: str, ours: str) -> None:
-    camera = camera_from_colmap(lens(model))
-    assert (camera.model, camera.width, camera.height) == (ours, 640, 480)
-    assert_colmap_projects_alike(lens(model))
-
-
-@pytest.mark.parametrize(
-    ("omega", "ours", "tolerance_px"),
-    [(0.3, "fov", 1e-9), (-0.9, "fov", 1e-9), (1.8, "fov", 1e-9), (1e-3, "fov", 1e-3), (0.0, "radtan", 1e-9)],
-)
-def test_field_of_view_of_any_size(omega: float, ours: str, tolerance_px: float) -> None:
-    """Below 0.01 rad COLMAP takes the first terms of a series, which is where the tolerance goes."""
-    assert camera_from_colmap(lens("FOV", omega=omega)).model == ours
-    assert_colmap_projects_alike(lens("FOV", omega=omega), tolerance_px)
-
-
-def test_every_model_of_colmap_is_ours() -> None:
-    assert set(LENSES) == set(CAMERA_PARAMS)
-
-
-def test_panorama_is_colmaps_all_around() -> None:
-    pycolmap = pytest.importorskip("pycolmap")
-    theirs = pycolmap.Camera(model="EQUIRECTANGULAR", width=640, height=480, params=[640.0, 480])
-    ours = camera_from_colmap(lens("EQUIRECTANGULAR"))
-    x_cam = np.random.default_rng(0).normal(size=(300, 3))
-    uv, valid = ours.project(x_cam)
-    assert valid.all()
-    np.testing.assert_allclose(uv + 0.5, theirs.img_from_cam(x_cam), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ours.unproject(uv)[0], theirs.cam_ray_from_img(uv + 0.5), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The report: a page that needs nothing but itself, pictures that say what happened, and a folder all or nothing."""
+"""The report: a page that needs nothing but itself, and a folder all or nothing."""
 
 import dataclasses
 import json
@@ -8,7 +8,6 @@ import subprocess
 import sys
 from base64 import b64decode
 from html import escape
-from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
 
@@ -16,151 +15,28 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from report_samples import (
+    PICTURES,
+    C,
+    G,
+    L,
+    Page,
+    U,
+    X,
+    a_map,
+    a_run,
+    page_of,
+    write,
+)
 
-from xalign_ros.core import lie
-from xalign_ros.core.camera import Camera
 from xalign_ros.core.errors import FormatError
 from xalign_ros.core.evaluation import summarize, summarize_errors
 from xalign_ros.core.records import (
     ANCHOR_REASONS,
     INPUT_REASONS,
-    AlignmentState,
-    Anchor,
-    Correction,
-    Norm,
-    Rejection,
     State,
-    Step,
 )
-from xalign_ros.core.reference_map import ReferenceMap
-from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.io import report, report_pictures, report_run
-from xalign_ros.io.report import write_report
-
-STEP_NS = 500_000_000
-START_NS = 1_403_636_579_763_555_584
-PICTURES = {"top_view.png", "error.png", "scale.png", "anchors.png", "step_time.png"}
-LEVEL = SE3(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))  # T_map_cam looking along y, z up
-U, C, L, G, X = State.UNINITIALIZED, State.CANDIDATE, State.LOCALIZED, State.COASTING, State.LOST
-STORY = [U, C, C] + 12 * [L] + 5 * [G] + 4 * [X] + 8 * [L]
-VOID = {"meta", "img", "br", "hr", "link", "input"}
-
-
-def a_map(*, metric=True, look=LEVEL, n=9):
-    rng = np.random.default_rng(3)
-    none = np.zeros((0, 1), np.uint8)
-    where = np.c_[np.linspace(0, 10, n), np.zeros(n), np.zeros(n)] @ (look.R @ LEVEL.R.T).T
-    camera = Camera("radtan", [400.0, 400, 320, 240], [], 640, 480)
-    return ReferenceMap(
-        map_id="street",
-        version="0123abc",
-        frame="map",
-        metric=metric,
-        source="a test",
-        descriptor_name="orb",
-        norm=Norm.HAMMING,
-        cameras=(camera,),
-        points=rng.uniform(-4, 14, (200, 3)),
-        point_cov=np.zeros((200, 3, 3), np.float32),
-        descriptors=np.zeros((200, 1), np.uint8),
-        keyframe_R=np.repeat(look.R[None], n, axis=0),
-        keyframe_t=where,
-        keyframe_camera=np.zeros(n, int),
-        feature_offset=np.zeros(n + 1, int),
-        feature_uv=np.zeros((0, 2), np.float32),
-        feature_descriptors=none,
-        feature_point=np.zeros(0, int),
-        sigma_px=1.0,
-        descriptor_gate=10.0,
-    )
-
-
-def a_run(story=STORY, *, session=0):
-    """(steps, step_s, odometry, truth): half a circle of radius 5 m; poses are 3 cm off in z, odometry half as long."""
-    S = Sim3(lie.so3_exp([0.1, 0.2, 0.3]), np.array([1.0, 2, 3]), 2.0)
-    steps, odometry, truth = [], [], []
-    for n, state in enumerate(story):
-        angle = np.pi * n / max(len(story), 2)
-        T = SE3(LEVEL.R, np.array([5 - 5 * np.cos(angle), 5 * np.sin(angle), 0.0]))
-        seen = SE3(T.R, T.t + np.array([0, 0, 0.03]))
-        who = (n, session, START_NS + n * STEP_NS)
-        cov = np.diag([1e-4] * 3 + [4e-4] * 3) * (1 + 3 * (state is G))
-        anchor = Anchor(*who, seen, cov, 90 + n, 60 + n, 1.0 + 0.01 * n)
-        reason = {U: "too_few_matches", C: "inconsistent", L: None, G: "too_few_inliers", X: "bad_pixel"}[state]
-        refused = Rejection(*who, reason, "why", 50, 20, 2.0, 0.0, anchor if state is C else None) if reason else None
-        known = state in (L, G, X)
-        steps.append(
-            Step(
-                *who,
-                AlignmentState(
-                    state=state,
-                    reason="2 anchors wait for <others>",
-                    score=0.5,
-                    session=session,
-                    stamp_ns=who[2],
-                    S_map_odom=S if known else None,
-                    scale_sigma=0.02 if known else np.nan,
-                    metric_scale=known,
-                    since_anchor_s=0.0,
-                    since_anchor_m=0.0,
-                    keyframes=n + 1,
-                    anchors_accepted=0,
-                    anchors_rejected=0,
-                    window=0,
-                ),
-                Correction(*who, S, np.eye(7) * 1e-4, seen, cov) if state in (L, G) else None,
-                anchor if reason is None else None,
-                refused,
-            )
-        )
-        odometry.append((S.inverse() @ T).rigid_pose())
-        truth.append(T)
-    return steps, [0.004 + 0.0001 * n for n in range(len(story))], odometry, truth
-
-
-def write(folder, run=None, *, truth=True, map_=None, title="run.mcap", **more):
-    steps, step_s, odometry, true = run or a_run()
-    result = summarize(steps, step_s, "ab" * 32)
-    if truth:
-        result |= summarize_errors(steps, odometry, true)
-    result |= more
-    write_report(folder, result, steps, step_s, odometry, true if truth else None, map_ or a_map(), title)
-    return result
-
-
-class Page(HTMLParser):
-    """Tags with their attributes, the text, and whether every tag was closed in order."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.words, self.open = [], [], []
-        self.feed(text)
-        self.close()
-        assert self.open == []
-        self.text = " ".join(" ".join(self.words).split())
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] != "style":
-            self.words.append(data)
-
-
-def page_of(folder):
-    return Page((folder / "index.html").read_text("utf-8"))
-
-
-def texts(figure):
-    return [t.get_text() for legend in figure.legends for t in legend.get_texts()]
 
 
 @pytest.fixture(scope="module")
@@ -298,140 +174,6 @@ def test_no_output_claims_metres_of_a_map_without_scale(tmp_path, quick):
     assert report_pictures._scale(run).axes[0].get_ylabel() == "map units per odometry unit"
     assert report_pictures._error(run).axes[0].get_ylabel() == "position (map units)"
     assert report_pictures._top_view(run).axes[0].get_xlabel().endswith("of the map (map units)")
-
-
-def test_a_stamp_that_goes_backwards_does_not_turn_time_back():
-    steps, *rest = a_run([L] * 6)
-    steps[3] = dataclasses.replace(steps[3], stamp_ns=START_NS - 10**15)
-    run = report_run.Run(steps, *rest, a_map())
-    np.testing.assert_allclose(run.time, [0, 0.5, 1, 1, 2, 2.5])
-    assert list(run.spans()) == [(L, 0.0, 2.5)]
-
-
-def test_odometry_of_refused_input_is_not_drawn():
-    steps, step_s, odometry, truth = a_run()
-    broken = SE3(np.full((3, 3), np.nan), np.full(3, np.nan))
-    refused = Rejection(4, 0, steps[4].stamp_ns, "bad_pose", "not finite")
-    steps[4] = dataclasses.replace(steps[4], anchor=None, correction=None, rejection=refused)
-    odometry[4] = broken
-    run = report_run.Run(steps, step_s, odometry, truth, a_map())
-    assert run.odometry[4] is None and len(run.fits) == 1
-    np.testing.assert_allclose(run.fits[0][1].s, 2.0)
-
-
-def test_each_session_is_fitted_by_itself():
-    parts = [a_run(), a_run(session=1)]
-    far = [(SE3.exp([1, 1, 1, 50, 50, 50]) @ o) for o in parts[1][2]]
-    steps, step_s, odometry, truth = (
-        list(a) + list(b) for a, b in zip(parts[0], (*parts[1][:2], far, parts[1][3]), strict=True)
-    )
-    for mine, S in report_run.Run(steps, step_s, odometry, truth, a_map()).fits:
-        x = np.array([o.t for o, m in zip(odometry, mine, strict=True) if m])
-        np.testing.assert_allclose(
-            S.apply(x), np.array([t.t for t, m in zip(truth, mine, strict=True) if m]), atol=1e-9
-        )
-
-
-# -- the pictures ----------------------------------------------------------------------------------------------------
-
-
-def test_top_view_names_what_it_shows():
-    everything = {"map points", "map keyframes", "truth", "odometry, fitted", "corrected", "corrected, COASTING"}
-    everything |= {"LOST, not published", "anchor, accepted", "anchor, rejected", "first pose"}
-    run = a_run()
-    assert set(texts(report_pictures._top_view(report_run.Run(*run, a_map())))) == everything
-    calm = a_run([L] * 8)
-    assert set(texts(report_pictures._top_view(report_run.Run(*calm[:3], None, a_map())))) == {
-        "map points", "map keyframes", "odometry, fitted", "corrected", "anchor, accepted", "first pose",
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize("draw", [draw for draw, _ in report.PICTURES.values()])
-def test_the_legend_covers_no_data_and_nothing_leaves_the_picture(draw):
-    with matplotlib.rc_context(dict(item.split("=") for item in report_pictures.STYLE.split())):
-        figure = draw(report_run.Run(*a_run(), a_map()))
-        figure.draw_without_rendering()
-    legend = figure.legends[0].get_window_extent()
-    for ax in figure.axes:
-        assert not legend.overlaps(ax.get_tightbbox())
-        assert ax.get_xlabel() or ax is not figure.axes[-1]
-    whole = figure.bbox.padded(1)
-    for artist in [figure.legends[0], *figure.axes, *(ax.title for ax in figure.axes)]:
-        box = artist.get_tightbbox()
-        assert whole.x0 <= box.x0 and box.x1 <= whole.x1 and whole.y0 <= box.y0 and box.y1 <= whole.y1
-
-
-def test_odometry_that_leads_anywhere_does_not_shrink_the_rest():
-    """Two poses millimetres apart fix no scale: what is fitted to them shoots off, and leaves the picture."""
-    steps, step_s, odometry, _ = a_run()
-    wild = [s if n in (5, 6) else dataclasses.replace(s, correction=None) for n, s in enumerate(steps)]
-    far = [SE3(o.R, o.t * (1 if n in (5, 6) else 1e4)) for n, o in enumerate(odometry)]
-    ax = report_pictures._top_view(report_run.Run(wild, step_s, far, None, a_map())).axes[0]
-    assert np.ptp(ax.get_xlim()) < 20 and np.ptp(ax.get_ylim()) < 20
-
-
-def test_reasons_have_a_row_each_and_none_where_nothing_was_rejected():
-    *_, rows = report_pictures._anchors(report_run.Run(*a_run(), a_map())).axes
-    assert [
-        t.get_text() for t in rows.get_yticklabels()
-    ] == "too few matches|too few inliers|inconsistent|bad pixel".split("|")
-    assert [line.get_color() for line in rows.lines] == [report_pictures.RED] * 3 + [report_pictures.INK]
-    assert [len(line.get_xdata()) for line in rows.lines] == [1, 5, 2, 4]
-    assert len(report_pictures._anchors(report_run.Run(*a_run([L] * 5), a_map())).axes) == 2
-
-
-def test_one_slow_step_does_not_flatten_the_others():
-    steps, step_s, odometry, truth = a_run()
-    ax = report_pictures._step_time(report_run.Run(steps, step_s, odometry, truth, a_map())).axes[0]
-    assert ax.get_yscale() == "linear" and ax.get_ylim()[0] == 0
-    ax = report_pictures._step_time(report_run.Run(steps, [1.0, *step_s[1:]], odometry, truth, a_map())).axes[0]
-    assert ax.get_yscale() == "log" and 1 < ax.get_ylim()[0] < 4 and ax.get_ylim()[1] > 1000
-
-
-def test_states_shade_the_background():
-    figure = report_pictures._scale(report_run.Run(*a_run(), a_map()))
-    shades = {p.get_label(): p for p in figure.axes[0].patches if not p.get_label().startswith("_")}
-    assert {"UNINITIALIZED", "CANDIDATE", "COASTING", "LOST"} <= set(shades)
-    lost = shades["LOST"].get_extents().transformed(figure.axes[0].transData.inverted())
-    np.testing.assert_allclose([lost.x0, lost.x1], [10.0, 12.0])
-
-
-@pytest.mark.parametrize("optical", [False, True])
-def test_plane_of_a_level_run_is_seen_from_above(optical):
-    """z up, or y down as in a camera's axes: the longer axis to the right, never a mirror image."""
-    turn = LEVEL.inverse() if optical else SE3.identity()
-    rng = np.random.default_rng(0)
-    path = turn.apply(rng.normal(size=(50, 3)) * [5, 1, 0.01])
-    axes, view = report_run.plane(path, a_map(look=turn @ LEVEL), np.zeros((0, 3)))
-    up = turn.R[:, 2]
-    assert view == ", seen from above"
-    np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-12)
-    assert np.cross(axes[0], axes[1]) @ up > 0.99 and axes[0] @ turn.R[:, 0] > 0.95
-
-
-def test_plane_of_a_climb_has_up_upwards_and_is_not_called_a_top_view():
-    path = np.random.default_rng(0).normal(size=(50, 3)) * [5, 0.01, 2]
-    axes, view = report_run.plane(path, a_map(), np.zeros((0, 3)))
-    assert view == "" and axes[1][2] > 0.95
-
-
-def test_plane_of_a_straight_line_is_that_of_the_map():
-    path, rng = np.c_[np.arange(9.0), np.zeros((9, 2))], np.random.default_rng(1)
-    axes, _ = report_run.plane(path, a_map(), rng.normal(size=(500, 3)) * [9, 3, 1])
-    np.testing.assert_allclose(np.abs(axes), [[1, 0, 0], [0, 1, 0]], atol=0.1)
-
-
-@pytest.mark.parametrize(
-    "axis, words",
-    [
-        ([1, 0, 0], "x of the map"),
-        ([0, -1, 0.01], "−y of the map"),
-        ([0.8, -0.6, 0], "0.80 x − 0.60 y of the map"),
-        ([-0.6, 0.8, 0.05], "−0.60 x + 0.80 y of the map"),
-    ],
-)
-def test_direction(axis, words):
-    assert report_run.direction(np.array(axis, float)) == words
 
 
 # -- the folder ------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from xalign_ros.core.keyframes import overall, scores, sequential
 from xalign_ros.core.tie_graph import connectivity
 from xalign_ros.core.tie_selection import active
 from xalign_ros.io.keyframe_parameters import KeyframeOptions
-from xalign_ros.io.tae import UsageError, help_of, image_numbers, parse
+from xalign_ros.io.tae import image_numbers
 from xalign_ros.io.text_files import write_text
 from xalign_ros.io.vicar_list import read_image_list, write_image_list
 from xalign_ros.io.vicar_matrix import TITLE, matrix_lines
@@ -20,22 +20,13 @@ from xalign_ros.io.vicar_views import placed, read_views, search_path
 
 USAGE = "usage: xalign keyframes inp=LIST out=KEYFRAMES.lis in_tpt=TIES.tpt [NAME=VALUE | -KEYWORD | --flag] ..."
 ABOUT = "The images that make good keyframes by the geometry of their ties, as a list. docs/vicar.md has the score."
+OPTIONS = KeyframeOptions
 
 
-def main(words: Sequence[str]) -> int:
-    """0 done, 2 wrong usage. Raises XalignError on bad input."""
-    if any(word.lower() in ("-h", "--help", "-help") for word in words):
-        print(help_of(KeyframeOptions, USAGE, ABOUT), end="")
-        return 0
-    try:
-        options = parse(KeyframeOptions, words)
-        options.check()
-    except UsageError as error:
-        print(f"xalign keyframes: {error}\n{USAGE}", file=sys.stderr)
-        return 2
+def run(options: KeyframeOptions) -> None:
+    """Raises XalignError on bad input."""
     names, lines = keyframes(options, lambda text: print(text, file=sys.stderr))
     print("".join(lines) + f"{len(names)} keyframes written to {options.out}")
-    return 0
 
 
 def keyframes(options: KeyframeOptions, say: Callable[[str], None] = lambda _: None) -> tuple[list[str], list[str]]:

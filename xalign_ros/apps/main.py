@@ -6,6 +6,7 @@ import argparse
 import importlib
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 
 import xalign_ros
 from xalign_ros.core.errors import XalignError
@@ -41,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = "player" if args.command == "replay" and args.live else args.command
     try:
         if own:
-            return int(importlib.import_module(f"xalign_ros.apps.{command}").main(words[1:]))
+            return _vicar(importlib.import_module(f"xalign_ros.apps.{command}"), words[1:])
         importlib.import_module(f"xalign_ros.apps.{command}").run(args)
     except XalignError as e:
         print(f"xalign: {e}", file=sys.stderr)
@@ -50,4 +51,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return 130
+    return 0
+
+
+def _vicar(app: ModuleType, words: Sequence[str]) -> int:
+    """A command of VICAR's syntax: its OPTIONS, USAGE, ABOUT, and run(options)."""
+    from xalign_ros.io.tae import UsageError, help_of, parse  # its imports are not worth waiting for, either
+
+    if any(word.lower() in ("-h", "--help", "-help") for word in words):
+        print(help_of(app.OPTIONS, app.USAGE, app.ABOUT), end="")
+        return 0
+    try:
+        options = parse(app.OPTIONS, words)
+        options.check()
+    except UsageError as error:
+        print(f"{app.USAGE.split(' inp=')[0].removeprefix('usage: ')}: {error}\n{app.USAGE}", file=sys.stderr)
+        return 2
+    app.run(options)
     return 0

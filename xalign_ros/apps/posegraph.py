@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
 
 from xalign_ros.apps.posegraph_run import posegraph
-from xalign_ros.io.tae import UsageError, help_of, parse
 from xalign_ros.io.vicar_log import as_json, log_lines
 from xalign_ros.io.vicar_parameters import Options
 
@@ -19,23 +17,14 @@ ABOUT = (
     "while they stay clear; --out-g2o OUT.g2o, --use-essential and --no-use-essential are understood, too; lists are "
     "(a,b,c). docs/vicar.md tells what differs from VICAR's own program."
 )
+OPTIONS = Options
 
 
-def main(words: Sequence[str]) -> int:
-    """0 done, 2 wrong usage. Raises XalignError on bad input."""
-    if any(word.lower() in ("-h", "--help", "-help") for word in words):
-        print(help_of(Options, USAGE, ABOUT), end="")
-        return 0
-    try:
-        options = parse(Options, words)
-        options.check()
-    except UsageError as error:
-        print(f"xalign posegraph: {error}\n{USAGE}", file=sys.stderr)
-        return 2
+def run(options: Options) -> None:
+    """Raises XalignError on bad input."""
     result = posegraph(options, lambda text: print(text, file=sys.stderr))
     out = sys.stderr if options.json else sys.stdout
     for line in log_lines(options, result):
         print(line, file=out)
     if options.json:
         print(json.dumps(as_json(result)))
-    return 0

@@ -29,7 +29,7 @@ class Cahv:
     A: Array
     H: Array
     V: Array
-    O: Array | None = None  # noqa: E741 - the field's own name
+    O: Array | None = None  # noqa: E741 - the model's letter, in papers and files, as C A H V R E are
     R: Array | None = None
     E: Array | None = None
     mtype: int = 3

@@ -99,9 +99,9 @@ def _error_of_h(H: Array, x: Array, y: Array) -> Array:
 def _error_of_f(F: Array, x: Array, y: Array) -> Array:
     """Sampson's distance in pixels."""
     a, b = (np.column_stack([p, np.ones(len(p))]) for p in (x, y))
-    l, m = a @ F.T, b @ F  # noqa: E741 - lines in the right and the left image
-    gradient = np.sqrt((l[:, :2] ** 2).sum(axis=1) + (m[:, :2] ** 2).sum(axis=1))
-    return np.asarray(np.abs((b * l).sum(axis=1)) / np.maximum(gradient, ZERO))
+    right, left = a @ F.T, b @ F  # lines in the two images
+    gradient = np.sqrt((right[:, :2] ** 2).sum(axis=1) + (left[:, :2] ** 2).sum(axis=1))
+    return np.asarray(np.abs((b * right).sum(axis=1)) / np.maximum(gradient, ZERO))
 
 
 def _gric(error_px: Array, d: int, k: int, r: int = 4) -> float:

@@ -9,11 +9,16 @@ import dataclasses
 import math
 import textwrap
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from xalign_ros.core.errors import ConfigError
 
-T = TypeVar("T")
+
+class Dataclass(Protocol):
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+
+T = TypeVar("T", bound=Dataclass)
 REQUIRED = dataclasses.MISSING
 
 
@@ -34,7 +39,7 @@ def parameter(
 
 def parse(kind: type[T], words: Sequence[str], positional: Sequence[str] = ("inp", "out")) -> T:
     """The dataclass `kind` from words of a command line. Raises UsageError."""
-    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    fields = {f.name: f for f in dataclasses.fields(kind)}
     found: dict[str, Any] = {}
     left = [name for name in positional]
 
