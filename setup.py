@@ -50,7 +50,6 @@ setup(
             "numpy>=2,<3",
             "scipy>=1.14,<2",
             "gtsam==4.3.0",
-            "qdldl==0.1.9.post1",
             "poselib==2.0.5",
             "opencv-contrib-python-headless==5.0.0.93",  # AKAZE has moved there
             "h5py>=3.11,<4",

@@ -244,7 +244,7 @@ def test_commands():
 
 
 # Import name -> name in package.xml and of the pip distribution, where they differ. None: rosdep has no key.
-ROSDEP = {name: None for name in ("gtsam", "poselib", "qdldl", "mcap", "zstandard", "rosbags", "rich")} | {
+ROSDEP = {name: None for name in ("gtsam", "poselib", "mcap", "zstandard", "rosbags", "rich")} | {
     "PIL": "python3-pil",
     "cv2": "python3-opencv",
     "h5py": "python3-h5py",

@@ -9,10 +9,10 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from xalign_ros.core.graph_band import SingularError
 from xalign_ros.core.graph_chain import State
 from xalign_ros.core.graph_descent import STAGE_TOLERANCE, TOLERANCE, Descent, approach, descend, path_of
 from xalign_ros.core.graph_equations import Equations, Stages, nodes_at, residuals_at, state_of
-from xalign_ros.core.graph_system import Band, SingularError
 from xalign_ros.core.lie import Array
 from xalign_ros.core.pose_graph import Anchors, PoseGraph
 from xalign_ros.core.transforms import Sim3
@@ -64,10 +64,10 @@ class Solution:
 def solve(graph: PoseGraph, *, max_iterations: int = 100, marginals: bool = False) -> Solution:
     """The nodes that fit all factors best: Levenberg-Marquardt on exact gradients, from the graph's start values.
 
-    Chains and whatever keeps near some order of the nodes are solved in time linear in the nodes, loops by a sparse
+    Chains and whatever keeps near some order of the nodes are solved in time linear in the nodes, loops by a multifrontal
     factor. Losses that push no outlier away are reached by way of ones that do. A connected part without anchor, prior
     or fixed node keeps its first node, one whose anchors leave the scale open its first node's scale. Raises ValueError
-    for marginals of a graph that leaves some direction open, or too large to have them.
+    for marginals of a graph that leaves some direction open.
     """
     equations = Equations(graph)
     state = state_of(graph.R, graph.t, graph.s)
@@ -151,19 +151,16 @@ def _named(graph: PoseGraph, rows: np.ndarray) -> str:
 
 def _marginals(graph: PoseGraph, equations: Equations, state: State, stages: Stages, held: np.ndarray) -> Array:
     """Diagonal blocks of the inverse normal equations, weights of the losses as they are at the solution."""
-    if not isinstance(equations.system, Band):
-        equations = Equations(graph, band_only=True)
-    band = equations.system
-    assert isinstance(band, Band)
+    system = equations.system
     equations.at(state, stages)
     rows, axes = np.nonzero(held[:, : equations.d])
-    band.hold(rows, axes)
+    system.hold(rows, axes)
     try:
-        band.factor()
+        system.factor()
     except SingularError:
         raise ValueError("the pose graph leaves some direction open, so there are no marginals") from None
     cov = np.zeros((len(graph), 7, 7))
-    cov[:, : equations.d, : equations.d] = band.marginals()
+    cov[:, : equations.d, : equations.d] = system.marginals()
     if not equations.local:
         R, _, sigma = nodes_at(state, slice(None))
         B = np.zeros((len(graph), 7, 7))

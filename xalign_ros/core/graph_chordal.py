@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
 
-from xalign_ros.core.graph_system import factored
 from xalign_ros.core.lie import Array, project_rotation
 from xalign_ros.core.pose_graph import MAX_LOG_SCALE, PoseGraph, SimilarityEdges
 
@@ -77,6 +77,6 @@ def _least_squares(A: sparse.csr_matrix, b: Array, weights: Array, known: np.nda
         return x
     free = A[:, ~known]
     right = free.T @ (weights[:, None] * (b - A[:, known] @ values[known]))
-    solve = factored(sparse.csc_matrix(free.T @ sparse.diags(weights) @ free))
-    x[~known] = np.stack([solve(column) for column in right.T], axis=1)
+    H = sparse.csc_matrix(free.T @ sparse.diags(weights) @ free)
+    x[~known] = splu(H, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve(right)
     return x

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from xalign_ros.core.graph_band import SingularError
 from xalign_ros.core.graph_chain import State, retract
 from xalign_ros.core.graph_equations import Equations, Stages, residuals_at
 from xalign_ros.core.graph_losses import AS_WIDE_AS_NEEDED, stages
-from xalign_ros.core.graph_system import SingularError
 from xalign_ros.core.lie import Array
 from xalign_ros.core.pose_graph import MAX_LOG_SCALE, Loss, PoseGraph
 

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from xalign_ros.core.graph_band import Band
 from xalign_ros.core.graph_chain import Chain, State
+from xalign_ros.core.graph_fronts import Fronts
 from xalign_ros.core.graph_losses import AS_WIDE_AS_NEEDED, Stage, bend, weigh, widened
 from xalign_ros.core.graph_residuals import Nodes, information, linearize, whitened
-from xalign_ros.core.graph_system import Band, Scatter, Sparse, system
+from xalign_ros.core.graph_system import Scatter, system
 from xalign_ros.core.lie import Array, quat_from_rotation, rotation_from_quat
 from xalign_ros.core.pose_graph import Factors, PoseGraph
 
@@ -32,7 +34,7 @@ class _Kind:
     gradient: Scatter
 
     @staticmethod
-    def of(name: str, block: Factors, into: Band | Sparse, nodes: int) -> _Kind:
+    def of(name: str, block: Factors, into: Band | Fronts, nodes: int) -> _Kind:
         i, j = block.i, getattr(block, "j", None)
         ends = i if j is None else np.concatenate([i, j])
         diagonal, gradient = Scatter.to(ends, into.diagonal), Scatter.to(ends, lambda n: n)
@@ -53,12 +55,12 @@ class Equations:
     Perturbations are those of graph_chain, or all on the right (`local`, where scales are kept).
     """
 
-    def __init__(self, graph: PoseGraph, *, band_only: bool = False) -> None:
+    def __init__(self, graph: PoseGraph) -> None:
         blocks = dict(graph.blocks())
         pairs = [(b.i, b.j) for b in blocks.values() if hasattr(b, "j")]
         i, j = (np.concatenate([pair[k] for pair in pairs] or [np.zeros(0, np.int64)]) for k in (0, 1))
         self.d = 7 if graph.free_scale else 6
-        self.system = system(len(graph), self.d, i, j, band_only)
+        self.system = system(len(graph), self.d, i, j)
         self.gradient = np.zeros((len(graph), self.d))
         self.costs: dict[str, float] = {}
         self.typical: dict[str, float] = {}  # median whitened length of kinds with a robust loss
