@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from xalign_ros.core.edge_lengths import with_lengths
 from xalign_ros.core.epipolar import Epipolar
 from xalign_ros.core.errors import FormatError
 from xalign_ros.core.lie import Array
 from xalign_ros.core.pointing import Pointing, View
 from xalign_ros.core.pose_graph import PoseGraph
 from xalign_ros.core.resection import anchors_of, resections
+from xalign_ros.core.tie_cycles import closing
 from xalign_ros.core.tie_graph import (
     Edge,
     Gates,
@@ -86,7 +88,14 @@ def posegraph(options: Options, say: Callable[[str], None] = lambda _: None) -> 
         references = (most_connected(ties, len(views)),)
     if not options.use_essential:
         note("without -USE_ESSENTIAL the edges repeat telemetry, so the result cannot be better than it")
-    edges = _edges(options, pairs_of(cropped(ties, views, options.edge_dist), views))
+    inner = cropped(ties, views, options.edge_dist)
+    pairs = pairs_of(inner, views)
+    edges = closing(_edges(options, pairs))
+    if options.use_essential and options.weak_telemetry:
+        edges = tuple(e if e.T_a_b is not None else weak_edge(p, e) for p, e in zip(pairs, edges, strict=True))
+    edges = with_lengths(edges, pairs, inner, views, metric=anchors is not None or len(references) > 1)
+    if options.information == "IDENTITY":
+        edges = tuple(replace(edge, cov=None) for edge in edges)
     graph = graph_of(views, edges, references, options.robust(), anchors)
     after, solution = views, None
     if anchors is not None or any(edge.T_a_b is not None for edge in edges):
@@ -158,16 +167,9 @@ def edges_of(options: Options, pairs: list[Pair]) -> list[Edge]:
     """Edges of some pairs, as one process computes them."""
     config = Epipolar(min_ties=options.min_ties)
     gates = Gates(options.max_quat_error, options.max_pos_error)
-    out = []
-    for pair in pairs:
-        if options.use_essential:
-            edge = essential_edge(pair, options.seed, config, gates)
-            if edge.T_a_b is None and options.weak_telemetry:
-                edge = weak_edge(pair, edge)
-        else:
-            edge = telemetry_edge(pair, options.seed, options.max_rand_noise, options.min_ties)
-        out.append(replace(edge, cov=None) if options.information == "IDENTITY" else edge)
-    return out
+    if options.use_essential:
+        return [essential_edge(pair, options.seed, config, gates) for pair in pairs]
+    return [telemetry_edge(pair, options.seed, options.max_rand_noise, options.min_ties) for pair in pairs]
 
 
 def _write(options: Options, loaded: Loaded, ties: Ties, graph: PoseGraph, result: Result) -> None:

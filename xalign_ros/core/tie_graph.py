@@ -37,10 +37,14 @@ class Gates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Images a < b with their ties after the crop, on bearings, and telemetry: T_a_b of cameras and of bodies, baseline m."""
+    """Images a < b with their ties after the crop, on bearings, and telemetry: T_a_b of cameras and of bodies, baseline m.
+
+    rows (N,): the places of its ties among those it was made of.
+    """
 
     a: int
     b: int
+    rows: np.ndarray
     left: Bearings
     right: Bearings
     T_cam: SE3
@@ -52,7 +56,11 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """A measured T_a_b of two bodies with covariance (6, 6), or None with the reason."""
+    """A measured T_a_b of two bodies with covariance (6, 6), or None with the reason.
+
+    `found`: what the ties say of the cameras. Its length is length_m, known to length_sigma of itself, by telemetry or by
+    `shared` points. triangles: of edges, that close, that do not.
+    """
 
     a: int
     b: int
@@ -64,6 +72,11 @@ class Edge:
     measures: Measures | None = None
     rotation_error_rad: float = np.nan
     position_error: float = np.nan  # part of the baseline
+    found: RelativeView | None = None
+    length_m: float = np.nan
+    length_sigma: float = SCALE_SIGMA
+    shared: int = 0
+    triangles: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,6 +174,7 @@ def pairs_of(ties: Ties, views: Sequence[View]) -> list[Pair]:
             Pair(
                 a,
                 b,
+                rows,
                 Bearings(rays[0, rows], per_px[0, rows], focal[a]),
                 Bearings(rays[1, rows], per_px[1, rows], focal[b]),
                 T_cam,
@@ -204,24 +218,30 @@ def essential_edge(pair: Pair, seed: int, config: Epipolar, gates: Gates) -> Edg
     found = relative_view(pair.left, pair.right, seed + 1_000_003 * pair.a + pair.b & 0x7FFFFFFF, config)
     if isinstance(found, Degenerate):
         return none(found.reason, found.measures)
-    T_cam, cov = _scaled(found, pair.baseline_m)
-    T = pair.mount_a @ T_cam @ pair.mount_b.inverse()
-    Ad = lie.sim3_adjoint(pair.mount_b.R, pair.mount_b.t, 1.0)[:6, :6]
+    whole = of_length(none("", found.measures), pair, pair.baseline_m, SCALE_SIGMA, found)
+    T = whole.T_a_b
+    assert T is not None
     turn = float(np.linalg.norm(lie.so3_log(pair.T_body.R.T @ T.R)))
     shift = float(np.linalg.norm(T.t - pair.T_body.t)) / pair.baseline_m
     if not np.cos(turn / 2) > 1 - gates.max_quat_error:
         return none(f"rotation is {np.rad2deg(turn):.1f} deg off telemetry", found.measures, turn, shift)
     if not shift < gates.max_pos_error:
         return none(f"position is {shift:.0%} of the baseline off telemetry", found.measures, turn, shift)
-    return Edge(pair.a, pair.b, ties, pair.baseline_m, T, Ad @ cov @ Ad.T, "", found.measures, turn, shift)
+    return replace(whole, rotation_error_rad=turn, position_error=shift)
 
 
-def _scaled(found: RelativeView, baseline_m: float) -> tuple[SE3, Array]:
-    D = np.r_[np.ones(3), np.full(3, baseline_m)]
+def of_length(edge: Edge, pair: Pair, length_m: float, sigma: float, found: RelativeView | None = None) -> Edge:
+    """The edge with cameras so far apart, known to `sigma` of that: T_a_b of the bodies and its covariance are made anew."""
+    found = found or edge.found
+    assert found is not None
+    T_cam = SE3(found.T_j_k.R, found.T_j_k.t * length_m)
+    D = np.r_[np.ones(3), np.full(3, length_m)]
     cov = D[:, None] * found.cov * D
-    along = found.T_j_k.R.T @ found.T_j_k.t * SCALE_SIGMA * baseline_m
+    along = T_cam.R.T @ T_cam.t * sigma
     cov[3:, 3:] += np.outer(along, along)
-    return SE3(found.T_j_k.R, found.T_j_k.t * baseline_m), cov
+    Ad = lie.sim3_adjoint(pair.mount_b.R, pair.mount_b.t, 1.0)[:6, :6]
+    T = pair.mount_a @ T_cam @ pair.mount_b.inverse()
+    return replace(edge, T_a_b=T, cov=Ad @ cov @ Ad.T, found=found, length_m=length_m, length_sigma=sigma)
 
 
 def telemetry_edge(pair: Pair, seed: int, noise: float, min_ties: int) -> Edge:

@@ -46,6 +46,10 @@ def log_lines(options: Options, r: Result) -> Iterator[str]:
         if np.isfinite(edge.rotation_error_rad):
             turn, shift = np.rad2deg(edge.rotation_error_rad), edge.position_error
             yield f"     Off telemetry by {turn:.3f} deg and {shift:.1%} of the baseline"
+        if sum(edge.triangles):
+            yield f"     Triangles of edges: {edge.triangles[0]} close, {edge.triangles[1]} do not"
+        if edge.shared:
+            yield f"     Length {edge.length_m:f} m, known to {edge.length_sigma:.1%} by {edge.shared} shared points"
         yield f"     {'no edge: ' if edge.T_a_b is None else 'edge'}{edge.reason and edge.T_a_b and ': '}{edge.reason}"
     for image, ties, inliers, reason in r.anchors:
         yield f"Image {image}: {ties} known places, {reason or f'anchored by {inliers}'}"
@@ -116,6 +120,9 @@ def _pair(edge: Edge) -> dict[str, Any]:
     if np.isfinite(edge.rotation_error_rad):
         turn = float(np.rad2deg(edge.rotation_error_rad))
         out |= {"off_telemetry_deg": turn, "off_telemetry_baselines": edge.position_error}
+    if edge.found is not None:
+        out |= {"length_m": edge.length_m, "length_sigma": edge.length_sigma, "shared_points": edge.shared}
+        out |= {"triangles_closed": edge.triangles[0], "triangles_open": edge.triangles[1]}
     if m is not None:
         out |= {
             "inliers": m.inliers,
