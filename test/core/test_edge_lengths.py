@@ -10,7 +10,8 @@ from xalign_ros.core.edge_lengths import tracks_of, with_lengths
 from xalign_ros.core.epipolar import Epipolar
 from xalign_ros.core.lie import so3_exp
 from xalign_ros.core.tie_cycles import closing
-from xalign_ros.core.tie_graph import Gates, essential_edge, pairs_of
+from xalign_ros.core.tie_edges import Gates, essential_edge
+from xalign_ros.core.tie_pairs import pairs_of
 from xalign_ros.core.ties import TieType
 from xalign_ros.core.transforms import SE3
 

@@ -12,19 +12,9 @@ from xalign_ros.core.lie import so3_exp, so3_log
 from xalign_ros.core.pointing import View, from_six, generic, pose_of, view_of
 from xalign_ros.core.pose_graph import Loss
 from xalign_ros.core.resection import anchors_of, resections
-from xalign_ros.core.tie_graph import (
-    Gates,
-    components,
-    connectivity,
-    cropped,
-    essential_edge,
-    graph_of,
-    most_connected,
-    pairs_of,
-    solved,
-    telemetry_edge,
-    weak_edge,
-)
+from xalign_ros.core.tie_edges import Gates, essential_edge, telemetry_edge, weak_edge
+from xalign_ros.core.tie_graph import components, connectivity, graph_of, most_connected, solved
+from xalign_ros.core.tie_pairs import cropped, pairs_of
 from xalign_ros.core.ties import Ties
 from xalign_ros.core.transforms import SE3
 

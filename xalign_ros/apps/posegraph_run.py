@@ -18,21 +18,9 @@ from xalign_ros.core.pointing import Pointing, View
 from xalign_ros.core.pose_graph import PoseGraph
 from xalign_ros.core.resection import anchors_of, resections
 from xalign_ros.core.tie_cycles import closing
-from xalign_ros.core.tie_graph import (
-    Edge,
-    Gates,
-    Pair,
-    Result,
-    connectivity,
-    cropped,
-    essential_edge,
-    graph_of,
-    most_connected,
-    pairs_of,
-    solved,
-    telemetry_edge,
-    weak_edge,
-)
+from xalign_ros.core.tie_edges import Edge, Gates, essential_edge, telemetry_edge, weak_edge
+from xalign_ros.core.tie_graph import Result, connectivity, graph_of, most_connected, solved
+from xalign_ros.core.tie_pairs import Pair, cropped, pairs_of
 from xalign_ros.core.tie_selection import active
 from xalign_ros.core.ties import Ties
 from xalign_ros.io.g2o import G2o, write_g2o

@@ -18,7 +18,8 @@ from scipy.sparse.csgraph import connected_components
 from xalign_ros.core.graph_fronts import Fronts
 from xalign_ros.core.lie import Array, so3_exp
 from xalign_ros.core.pointing import View
-from xalign_ros.core.tie_graph import SCALE_SIGMA, Edge, Pair, of_length
+from xalign_ros.core.tie_edges import SCALE_SIGMA, Edge, of_length
+from xalign_ros.core.tie_pairs import Pair
 from xalign_ros.core.ties import Ties, TieType
 from xalign_ros.core.tracks import seen_twice
 from xalign_ros.core.transforms import SE3

@@ -11,7 +11,8 @@ import numpy as np
 
 from xalign_ros.core.lie import Array
 from xalign_ros.core.pointing import View
-from xalign_ros.core.tie_graph import connectivity, cropped
+from xalign_ros.core.tie_graph import connectivity
+from xalign_ros.core.tie_pairs import cropped
 from xalign_ros.core.ties import Ties
 
 FEW, NO_H, NO_F, NO_GRIC, NO_MOTION, TURN_ONLY = -1.0, -2.0, -3.0, -4.0, -5.0, -6.0

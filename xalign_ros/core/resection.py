@@ -12,7 +12,7 @@ from xalign_ros.core.epipolar import Bearings, sample_absolute
 from xalign_ros.core.lie import Array
 from xalign_ros.core.pointing import View
 from xalign_ros.core.pose_graph import Anchors, Chart, Loss
-from xalign_ros.core.tie_graph import bearings_of
+from xalign_ros.core.tie_pairs import bearings_of
 from xalign_ros.core.ties import Ties
 from xalign_ros.core.transforms import SE3
 

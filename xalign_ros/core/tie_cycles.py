@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from xalign_ros.core.lie import so3_log
-from xalign_ros.core.tie_graph import Edge
+from xalign_ros.core.tie_edges import Edge
 
 SIGMAS = 5.0
 LEAST_RAD = float(np.deg2rad(0.1))  # below it a triangle is closed, whatever the covariances say

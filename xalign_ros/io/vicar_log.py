@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from xalign_ros.core.lie import so3_log
-from xalign_ros.core.tie_graph import Edge, Result
+from xalign_ros.core.tie_edges import Edge
+from xalign_ros.core.tie_graph import Result
 from xalign_ros.io.vicar_matrix import TITLE, matrix_lines
 from xalign_ros.io.vicar_parameters import Options
 
