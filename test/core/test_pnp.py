@@ -173,6 +173,26 @@ def test_points_on_one_line_are_degenerate():
     assert estimate_pose(m, worlds.CAMERA, 0, CONFIG) in ("degenerate", "too_few_inliers")
 
 
+@pytest.mark.parametrize(
+    "size, away, tilt", [(1, 2, 0.5), (1, 3, 0.5), (1, 3, 0.2), (2, 5, 0.8), (2, 6, 0.25), (1, 6, 0.4)]
+)
+def test_a_small_plane_is_never_taken_for_its_mirror_image(size, away, tilt):
+    """Schweighofer and Pinz (2006): from afar two poses fit. Where that is so, the matches' spread is too small."""
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        n, sigma = int(rng.choice([30, 60, 150])), float(rng.choice([1.0, 2.0, 3.0]))
+        T = SE3.exp(np.r_[tilt * np.array([np.cos(seed), np.sin(seed)]), np.zeros(4)])
+        xyz = np.column_stack([rng.uniform(-size / 2, size / 2, (n, 2)), np.zeros(n)])
+        x_cam = T.apply(xyz) + [0, 0, away]
+        T_map_cam = SE3(T.R, np.array([0, 0, away])).inverse()
+        uv = worlds.CAMERA.project(x_cam)[0] + rng.normal(0, sigma, (n, 2))
+        m = Points2D3D(uv, np.full(n, sigma), xyz, np.zeros((n, 3, 3)))
+        pose = estimate_pose(m, worlds.CAMERA, seed, CONFIG)
+        if isinstance(pose, Pose):
+            d = error(pose, T_map_cam)
+            assert d @ np.linalg.solve(pose.cov_cam, d) < 40
+
+
 def test_residuals_far_above_the_noise_are_refused():
     """Inside the gate but spread over it: with a gate this wide not noise but another shape."""
     config = replace(CONFIG, threshold_sigmas=20.0)
