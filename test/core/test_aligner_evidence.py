@@ -272,3 +272,15 @@ def test_memory_is_bounded(evidence):
     early, late = np.array(sizes[50:100]), np.array(sizes[-50:])
     assert (late[:, 0] == 12).all() and (late[:, 1:4] == 10).all()
     assert (late.max(axis=0) <= early.max(axis=0)).all()
+
+
+def test_anchors_found_later_lock_though_the_newest_keyframe_has_none(evidence, monkeypatch):
+    """Three earlier keyframes are found together at the fifth, which itself sees nothing: it is in the map all the same."""
+    drive = Drive(8, 9)
+    third = {a.keyframe_id: a for a in drive.anchors[1:4]}
+    monkeypatch.setattr(module, "find_together", lambda seen, *_: third if seen[-1].keyframe.id == 14 else {})
+    steps = evidence(drive, [drive.anchors[0], *[None] * 7])
+    assert [s.correction is not None for s in steps] == [False] * 4 + [True] * 4
+    assert steps[4].rejection is not None and {a.keyframe_id for a in steps[4].believed} == {10, 11, 12, 13}
+    assert states(steps)[4] is State.LOCALIZED and steps[4].state.since_anchor_m > 0
+    assert nees(steps[4].correction, drive.truth[4]) < 30

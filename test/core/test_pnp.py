@@ -183,7 +183,7 @@ def test_a_small_plane_is_never_taken_for_its_mirror_image(size, away, tilt):
         n, sigma = int(rng.choice([30, 60, 150])), float(rng.choice([1.0, 2.0, 3.0]))
         T = SE3.exp(np.r_[tilt * np.array([np.cos(seed), np.sin(seed)]), np.zeros(4)])
         xyz = np.column_stack([rng.uniform(-size / 2, size / 2, (n, 2)), np.zeros(n)])
-        x_cam = T.apply(xyz) + [0, 0, away]
+        x_cam = T.apply(xyz) + np.array([0, 0, away])
         T_map_cam = SE3(T.R, np.array([0, 0, away])).inverse()
         uv = worlds.CAMERA.project(x_cam)[0] + rng.normal(0, sigma, (n, 2))
         m = Points2D3D(uv, np.full(n, sigma), xyz, np.zeros((n, 3, 3)))

@@ -60,6 +60,7 @@ class Belief:
         self._window: Window | None = None
         self._anchored: _Link | None = None  # the last keyframe whose anchor was accepted
         self._parties = 0
+        self._found_later = False  # anchors of earlier keyframes, since the last judgement
         self.estimate: Estimate | None = None
         self.unlocked = state, reason
 
@@ -109,8 +110,10 @@ class Belief:
             self.estimate = self._window.solve()
             if self.estimate is None:
                 found = self._give_up(found)
-        if isinstance(found, Rejection) and found.anchor is not None and found.anchor is link.anchor:
+        waits = isinstance(found, Rejection) and found.anchor is not None and found.anchor is link.anchor
+        if isinstance(found, Rejection) and (waits or self._found_later):
             found, believed = self._challenge(found)
+        self._found_later = False
         if isinstance(found, Anchor):
             link.accepted = True
             self._anchored = link
@@ -123,6 +126,7 @@ class Belief:
         for link in self._links:
             if link.anchor is None and link.keyframe.id in anchors:
                 link.anchor = anchors[link.keyframe.id]
+                self._found_later = True
 
     # -- the estimate --------------------------------------------------------------------------------------------
 
@@ -174,8 +178,7 @@ class Belief:
         return refused(found, "inconsistent", WAITS) if isinstance(found, Anchor) else found
 
     def _challenge(self, found: Rejection) -> tuple[Anchor | Rejection, tuple[Anchor, ...]]:
-        """Find the newest waiting anchor's party, and let it take over if it may."""
-        assert found.anchor is not None
+        """Find the newest waiting anchor's party, and let it take over if it may; the newest keyframe may have none."""
         waiting = [link for link in self._links if link.anchor is not None and not link.accepted][-PARTY_REACH:]
         consensus = find_consensus(_witnesses(waiting), waiting[-1].keyframe.metric_scale, self.config)
         if consensus is None:
@@ -184,7 +187,8 @@ class Belief:
         party = self._united(agreeing)
         if not self._may_take_over(consensus, agreeing, party) or not self._lock(consensus, party):
             return found, ()
-        return found.anchor, tuple(link.anchor for link in party[:-1] if link.anchor)
+        believed = tuple(link.anchor for link in party if link.anchor)
+        return (believed[-1], believed[:-1]) if party[-1] is self._links[-1] else (found, believed)
 
     def _united(self, agreeing: list[_Link]) -> list[_Link]:
         """All links of the parties to which these belong, as one party from now on."""
@@ -228,7 +232,7 @@ class Belief:
         for link in self._links:
             link.accepted = id(link) in member
             link.party = -1
-        self._window, self.estimate = window, estimate
+        self._window, self.estimate, self._anchored = window, estimate, members[-1]
         return True
 
 
