@@ -38,7 +38,7 @@ def test_one_step_out_of_all_proportion_is_a_leap_and_hides_no_other() -> None:
 
 def test_turning_on_the_spot_by_much_is_a_leap_too() -> None:
     assert with_leap(edge(0.1, 1.0), [(0.1, 0.05)] * 5, 1.0).sigmas[0] == pytest.approx(1)
-    assert with_leap(edge(0.1, 0.25), [(0.1, 0.05)] * 5, 1.0).sigmas[0] == SIGMAS[0]
+    assert with_leap(edge(0.1, 0.5), [(0.1, 0.01)] * 5, 1.0).sigmas[0] == SIGMAS[0]  # a corner
 
 
 def test_driving_off_is_none_for_long() -> None:

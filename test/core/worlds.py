@@ -7,7 +7,6 @@ covariance can be held against its errors: S_map_j = S_map_i Z Exp(n) with Z wha
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,9 +16,9 @@ from xalign_ros.core.camera import Camera
 from xalign_ros.core.config import Odometry
 from xalign_ros.core.lie import so3_exp
 from xalign_ros.core.map_building import build_map
-from xalign_ros.core.odometry import METRIC_WALK
 from xalign_ros.core.records import NO_TRACK, Features, Keyframe
 from xalign_ros.core.reference_map import ReferenceMap
+from xalign_ros.core.simulation import camera_at, drifting
 from xalign_ros.core.transforms import SE3, Sim3
 
 CAMERA = Camera("radtan", [420.0, 420.0, 319.5, 239.5], [-0.05, 0.01, 0.0005, -0.0005], 640, 480)
@@ -57,12 +56,6 @@ class Run:
 
 
 # Paths: T_map_cam with the camera level, looking along the heading turned by `aside`. -------------------------------
-
-
-def camera_at(x: float, y: float, z: float, yaw: float) -> SE3:
-    """Optical axis along yaw in the map's horizontal plane (x forward at 0, y left), z up."""
-    forward, left, up = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0]), np.eye(3)[2]
-    return SE3(np.column_stack([-left, -up, forward]), [x, y, z])
 
 
 def along_line(count: int, step: float, shift: float = 0.0, aside: float = 0.5) -> list[SE3]:
@@ -124,26 +117,6 @@ def seen_from(
 
 def features_at(world: World, T_map_cam: SE3, seed: tuple[int, ...]) -> Features:
     return seen_from(world.points, world.codes, T_map_cam, np.random.default_rng([5, *seed]), ids=RUN_IDS)
-
-
-def drifting(
-    truth: Sequence[SE3], rng: np.random.Generator, noise: Odometry, S_map_odom: Sim3, metric: bool = False
-) -> tuple[list[SE3], list[Sim3]]:
-    """T_odom_cam of an odometry with `noise`, that starts with S_map_odom, and S_map_i: its local scale and the truth."""
-    first = S_map_odom.inverse() @ truth[0]
-    T, S = [SE3(first.R, first.t)], [Sim3(truth[0].R, truth[0].t, S_map_odom.s)]
-    for a, b in itertools.pairwise(truth):
-        metres = float(np.linalg.norm(b.t - a.t))
-        turn = np.hypot(noise.rotation_floor_rad, noise.rotation_rad_per_sqrt_m * np.sqrt(metres))
-        shift = np.hypot(noise.translation_floor_m, noise.translation_ratio * metres) / S[-1].s
-        walk = (METRIC_WALK * noise.metric_scale_sigma if metric else noise.scale_per_sqrt_m) * np.sqrt(
-            max(metres, 1e-4)
-        )
-        n = rng.normal(size=7) * np.r_[[turn] * 3, [shift] * 3, walk]
-        S.append(Sim3(b.R, b.t, S[-1].s * float(np.exp(n[6]))))
-        Z = S[-2].inverse() @ S[-1] @ Sim3.exp(n).inverse()
-        T.append(T[-1] @ Z.rigid_pose())
-    return T, S
 
 
 def any_similarity(rng: np.random.Generator) -> Sim3:
