@@ -17,6 +17,7 @@ COMMANDS = {
     "map": "build, inspect and check reference maps",
     "replay": "align a log to a map, without ROS or (--live) through the running node",
     "batch": "smooth whole logs: every keyframe's pose from all the evidence",
+    "bundle": "adjust poses and points of a COLMAP model or pyTheia's file",
     "simulate": "a seeded world as map, log and truth",
     "solve": "solve a pose graph in a g2o file",
     "posegraph": "poses of images from tiepoints, with the arguments and files of VICAR's POSEGRAPH",

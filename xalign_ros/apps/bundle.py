@@ -1,0 +1,87 @@
+"""xalign bundle: poses and points of a reconstruction to where its observations agree best."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from xalign_ros.core.bundle import adjust
+from xalign_ros.core.errors import MapError
+from xalign_ros.core.pose_graph import LOSSES, Loss
+from xalign_ros.core.reconstruction import Reconstruction
+from xalign_ros.io.reconstruction_files import read_reconstruction, write_reconstruction
+
+WIDTH = 2.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("model", type=Path, metavar="MODEL", help="folder of a COLMAP model, or pyTheia's file")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="OUT", help="adjusted, in the format of MODEL"
+    )
+    parser.add_argument("--force", action="store_true", help="replace an existing output")
+    parser.add_argument(
+        "--robust",
+        type=_loss,
+        default=Loss("huber", WIDTH),
+        metavar="LOSS[:WIDTH]",
+        help=f"on each reprojection: {', '.join(LOSSES)}; WIDTH in standard deviations (default: huber:{WIDTH:g})",
+    )
+    parser.add_argument(
+        "--hold", action="append", default=[], metavar="VIEW", help="name of a view that stays; may be repeated"
+    )
+    parser.add_argument("--hold-points", action="store_true", help="points stay, only poses move")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of words")
+
+
+def _loss(text: str) -> Loss:
+    name, _, width = text.partition(":")
+    try:
+        return Loss(name, float(width) if width else WIDTH)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def run(args: argparse.Namespace) -> None:
+    """Without --hold and priors the first estimated view stays and the scale is as the points have it."""
+    if args.output.exists() and not args.force:
+        raise MapError(f"{args.output} exists; give another name or --force to replace it")
+    r = read_reconstruction(args.model)
+    held = _held(args.model, r, args.hold)
+    if not held.any() and r.priors is None and not args.hold_points:
+        held[np.flatnonzero(r.estimated)[:1]] = True
+    try:
+        done = adjust(
+            r,
+            constant_views=held,
+            constant_tracks=np.full(len(r.track_ids), args.hold_points),
+            loss=args.robust,
+        )
+    except ValueError as error:
+        raise MapError(f"{args.model}: {error}") from error
+    write_reconstruction(done.reconstruction, args.output, folder=args.model.is_dir(), force=args.force)
+    if not done.converged:
+        print("it has not converged; what is written is the best found", file=sys.stderr)
+    result = {
+        "views": int(r.estimated.sum()),
+        "views_held": int((held & r.estimated).sum()),
+        "tracks": int(r.track_estimated.sum()),
+        "observations": done.observations,
+        "observations_skipped": done.skipped,
+        "initial_cost": done.initial_cost,
+        "cost": done.cost,
+        "iterations": done.iterations,
+        "converged": done.converged,
+    }
+    print(json.dumps(result) if args.json else "\n".join(f"{key:22s} {value}" for key, value in result.items()))
+
+
+def _held(path: Path, r: Reconstruction, names: list[str]) -> np.ndarray:
+    unknown = [name for name in names if name not in r.names]
+    if unknown:
+        raise MapError(f"{path} has no view '{unknown[0]}'; its first is '{r.names[0] if r.names else ''}'")
+    return np.isin(np.array(r.names, dtype=object), names)
