@@ -20,6 +20,7 @@ from xalign_ros.core.pose_graph import PoseGraph
 from xalign_ros.core.records import Keyframe, Step
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.run_graph import run_graph
+from xalign_ros.io.adapter_log import Chosen, add_source_arguments, log_keyframes, read_source
 from xalign_ros.io.config_file import read_config
 from xalign_ros.io.log import Log
 from xalign_ros.io.tum import Trajectory, write_tum
@@ -27,27 +28,32 @@ from xalign_ros.io.xmap import read_map
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="logs with keyframes")
+    parser.add_argument(
+        "logs", type=Path, nargs="+", metavar="LOG", help="mcap files, rosbag2 folders or rosbag1 files"
+    )
     parser.add_argument("--map", type=Path, required=True, metavar="MAP", help="reference map (.xmap folder)")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="folder for LOG.tum and LOG.json"
     )
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with options that differ from the defaults")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one option; may be repeated")
-    parser.add_argument("--keyframe-topic", metavar="TOPIC", help="needed where a log has several")
+    told = "of the keyframes, or of the --source's poses; needed where a log has several"
+    parser.add_argument("--keyframe-topic", metavar="TOPIC", help=told)
+    add_source_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of words")
 
 
 def run(args: argparse.Namespace) -> None:
     """One log after the other; each is read through before anything is written for it."""
     config, map_ = read_config(args.config, args.set), read_map(args.map, verify=True)
+    source, chosen = read_source(args), Chosen(args.keyframe_topic, args.image_topic)
     names = [log.stem for log in args.logs]
     if len(set(names)) < len(names):
         raise MapError(f"two logs are named {max(names, key=names.count)}; their results would overwrite each other")
     results = {}
     for path, name in zip(args.logs, names, strict=True):
         with Log(path) as log:
-            run_ = [(keyframe, fault) for _, keyframe, fault in log.keyframes(log.keyframe_topic(args.keyframe_topic))]
+            run_ = [(k, fault) for _, k, fault in log_keyframes(log, source, config.selection, map_, chosen)]
         trajectory, result = smooth(run_, map_, config)
         args.output.mkdir(parents=True, exist_ok=True)
         write_tum(args.output / f"{name}.tum", trajectory)

@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
+from xalign_ros.io.adapter_log import sources_of
 from xalign_ros.io.log import Log
 
 
@@ -20,7 +21,9 @@ def run(args: argparse.Namespace) -> None:
     with Log(args.log) as log:
         topics = log.topics()
     if args.json:
-        print(json.dumps({"topics": [{"name": t.name, "type": t.type, "messages": t.messages} for t in topics]}))
+        listed = [{"name": t.name, "type": t.type, "messages": t.messages} for t in topics]
+        print(json.dumps({"topics": listed, "sources": sources_of(topics)}))
         return
     for t in topics:
         print(f"{t.messages:8d}  {t.type:40s} {t.name}")
+    print(f"for `xalign replay --source`: {', '.join(sources_of(topics)) or 'nothing that makes keyframes'}")

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from xalign_ros.core.aligner import Aligner
+from xalign_ros.io.adapter_log import Chosen, add_source_arguments, log_keyframes, read_source
 from xalign_ros.io.config_file import read_config
 from xalign_ros.io.log import Log, typestore
 from xalign_ros.io.messages import correction_digest, correction_fields
@@ -19,9 +20,7 @@ from xalign_ros.io.xmap import read_map
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "log", type=Path, metavar="LOG", help="mcap file, rosbag2 folder or rosbag1 file with keyframes"
-    )
+    parser.add_argument("log", type=Path, metavar="LOG", help="mcap file, rosbag2 folder or rosbag1 file")
     parser.add_argument("--map", type=Path, required=True, metavar="MAP", help="reference map (.xmap folder)")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="OUT.mcap", help="log of corrections, anchors, states, poses"
@@ -31,7 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", type=Path, metavar="DIR", help="folder for a report with pictures")
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with options that differ from the defaults")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one option; may be repeated")
-    parser.add_argument("--keyframe-topic", metavar="TOPIC", help="needed where a log has several")
+    told = "of the keyframes, or of the --source's poses; needed where a log has several"
+    parser.add_argument("--keyframe-topic", metavar="TOPIC", help=told)
+    add_source_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of words")
     parser.add_argument("--live", action="store_true", help="play into the running ROS graph and watch the node there")
     parser.add_argument(
@@ -43,15 +44,16 @@ def run(args: argparse.Namespace) -> None:
     """Raises XalignError on bad input; what it has written by then is gone."""
     check_report(args.report, [args.log, args.map, args.truth, args.config, args.output, args.trajectory])
     config = read_config(args.config, args.set)
+    source, chosen = read_source(args), Chosen(args.keyframe_topic, args.image_topic)
     map_ = read_map(args.map, verify=True)
     truth = read_truth(args.truth)
     aligner, record, types = Aligner(map_, config), Run(), typestore().types.__getitem__
     with ExitStack() as stack:
         log = stack.enter_context(Log(args.log))
-        topic = log.keyframe_topic(args.keyframe_topic)
+        keyframes = log_keyframes(log, source, config.selection, map_, chosen)
         output = OutputLog(args.output, stack)
         frame = "odom"
-        for _, keyframe, fault in log.keyframes(topic):
+        for _, keyframe, fault in keyframes:
             start = time.perf_counter()
             step = aligner.step(keyframe, fault)
             record.add(step, time.perf_counter() - start, keyframe.T_odom_cam if keyframe is not None else None)

@@ -118,6 +118,17 @@ class Output:
 
 
 @dataclass(frozen=True, slots=True)
+class Selection:
+    """Which images become keyframes, where a source brings odometry and images but no keyframes."""
+
+    moved_m: float = option(0.2, "m", "way from one keyframe to the next of an odometry in metres", 0.001, 1000.0)
+    moved_s: float = option(0.3, "s", "of any other: the way that it usually makes in this time", 0.01, 1000.0)
+    turned_deg: float = option(8.0, "deg", "turn from one keyframe to the next", 0.1, 180.0)
+    waited_s: float = option(1.0, "s", "time from one keyframe to the next where nothing moves", 0.01, 1e6)
+    rate_hz: float = option(10.0, "Hz", "keyframes per second at most", 0.01, 1000.0)
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The whole tree."""
 
@@ -128,6 +139,7 @@ class Config:
     window: Window = field(default_factory=Window)
     status: Status = field(default_factory=Status)
     output: Output = field(default_factory=Output)
+    selection: Selection = field(default_factory=Selection)
 
 
 def options(config: Config) -> Iterator[tuple[str, Value, Field[Any]]]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from xalign_ros.core.errors import LogError
 from xalign_ros.core.lie import Array
 from xalign_ros.core.transforms import SE3
-from xalign_ros.io.log import Log, typestore
+from xalign_ros.io.log import Log
 from xalign_ros.io.ros_fields import covariance_from_ros, pose_seven, stamp_of
 from xalign_ros.io.tum import Trajectory
 
@@ -28,7 +27,7 @@ def read_corrections(path: Path) -> tuple[Trajectory, Array]:
         found = {}
         for message in log.raw_messages(names):
             try:
-                m: Any = typestore().deserialize_cdr(message.data, CORRECTION)
+                m = message.message()
                 pose = pose_seven(m.pose.pose)
                 T = SE3.from_quat(pose[3:], pose[:3])
                 found[stamp_of(m.header.stamp)] = T, covariance_from_ros(np.asarray(m.pose.covariance), T.R)

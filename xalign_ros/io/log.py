@@ -59,6 +59,10 @@ class RawMessage(NamedTuple):
     log_time_ns: int
     data: bytes
 
+    def message(self) -> Any:
+        """Of a type that `typestore` has; raises whatever bytes that are none make it raise."""
+        return _deserialized(typestore(), self.data, self.type)
+
 
 @cache
 def typestore() -> Typestore:

@@ -1,0 +1,293 @@
+"""Odometry and images, as the sources that people run publish them, to keyframes; live and in replay by the same code.
+
+`Adapter.take` is quick: it reads poses, and of images the header only. What it gives, `Frame`s, are keyframes whose image
+nobody has looked at yet; `keyframe_from_frame` does that, in another process if there is one.
+
+| kind     | pose                  | points         | camera in base   | intrinsics       |
+|----------|-----------------------|----------------|------------------|------------------|
+| odometry | Odometry, at any rate |                | /tf_static       | camera_info      |
+| vins     | keyframe_pose         | keyframe_point | extrinsic        | camera_info      |
+| openvins | loop_pose             | loop_feats     | loop_extrinsic   | loop_intrinsics  |
+
+Facts about the publishers: VINS-Mono and VINS-Fusion `visualization.cpp` (pubKeyframe), OpenVINS `ROS2Visualizer.cpp`.
+Neither gives a covariance. OpenVINS's quaternions are JPL ones of global-to-IMU, which as numbers are Hamilton's of
+IMU-to-global, so they are read as any other; its loop_intrinsics tell no image size. The covariance of nav_msgs/Odometry
+is not used: of most sources it is constant, or that of the last step, and what is needed is the marginal.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from xalign_ros.core.camera import Camera
+from xalign_ros.core.config import Selection
+from xalign_ros.core.errors import ConfigError
+from xalign_ros.core.extraction import Extract
+from xalign_ros.core.records import Features, Keyframe, Rejection
+from xalign_ros.core.source import MOST_BYTES, MOST_IMAGES, KeyframeSource, OdometrySource, Selector, Shot, Source
+from xalign_ros.core.trail import Trail
+from xalign_ros.core.transforms import SE3
+from xalign_ros.io import ros_fields as ros
+from xalign_ros.io.frame_messages import TF, StaticTree
+from xalign_ros.io.image_message import COMPRESSED, IMAGE, RawImage, pixels, raw_image
+from xalign_ros.io.messages import NO_FEATURES
+from xalign_ros.io.odometry_message import ODOMETRY, odometry_pose
+from xalign_ros.io.source_points import POINTS, SeenPoints, disagreement, points_from_message, positions
+
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+
+
+class Role(NamedTuple):
+    """What a topic is for: its name in the live node, and its type."""
+
+    topic: str
+    type: str
+
+
+KINDS: dict[str, dict[str, Role]] = {
+    "odometry": {"pose": Role("odometry", ODOMETRY), "camera": Role("camera_info", CAMERA_INFO)},
+    "vins": {
+        "pose": Role("keyframe_pose", ODOMETRY),
+        "points": Role("keyframe_point", POINTS),
+        "extrinsic": Role("extrinsic", ODOMETRY),
+        "camera": Role("camera_info", CAMERA_INFO),
+    },
+    "openvins": {
+        "pose": Role("loop_pose", ODOMETRY),
+        "points": Role("loop_feats", POINTS),
+        "extrinsic": Role("loop_extrinsic", ODOMETRY),
+        "camera": Role("loop_intrinsics", CAMERA_INFO),
+    },
+}
+IMAGES = {"image": Role("image", IMAGE), "compressed": Role("image/compressed", COMPRESSED)}
+STATIC = {"static": Role("/tf_static", TF)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SourceOptions:
+    """What the source is and what it does not tell itself.
+
+    features names the extractor ("" = the map's); camera and T_base_cam, where given, go before what messages say;
+    metric_scale is about the odometry of kind "odometry", the others are metric.
+    """
+
+    kind: str = "keyframes"
+    features: str = ""
+    camera: Camera | None = None
+    T_base_cam: SE3 | None = None
+    metric_scale: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("keyframes", *KINDS):
+            raise ConfigError(f"there is no source '{self.kind}'; it is one of keyframes, {', '.join(KINDS)}")
+
+    @property
+    def metric(self) -> bool:
+        return self.metric_scale or self.kind != "odometry"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A keyframe whose image is still to be looked at; `camera` has the fields of a CameraInfo, or is a Camera."""
+
+    stamp_ns: int
+    session: int
+    id: int
+    T_odom_cam: SE3
+    image: RawImage
+    camera: Any
+    odom_frame: str
+    metric: bool
+    points: SeenPoints | None = None
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+
+@dataclass(slots=True)
+class _Heard:
+    """What the messages said last."""
+
+    odom_frame: str = "odom"
+    base_frame: str = ""
+    camera: Any = None
+    T_base_cam: SE3 | None = None
+    tree: StaticTree = field(default_factory=StaticTree)
+
+
+class Adapter:
+    """Messages in, in the order in which they came; frames out. `refused` counts what could not be used, by reason."""
+
+    def __init__(self, options: SourceOptions, selection: Selection, with_points: bool = True) -> None:
+        """`with_points`: whether there is a topic of points, for which a keyframe waits."""
+        self._options, self.refused, self.detail = options, Counter[str](), dict[str, str]()
+        trail = Trail(selection, options.metric)
+        self._source: Source = OdometrySource(trail, self._refuse)
+        self._selector: Selector | None = Selector(selection, options.metric)
+        if options.kind != "odometry":
+            self._source, self._selector = KeyframeSource(trail, self._refuse, with_points), None
+        self._shots: deque[Shot] = deque()
+        self._heard = _Heard(camera=options.camera, T_base_cam=options.T_base_cam)
+        self._next_id = 0
+
+    def take(self, role: str, message: Any) -> list[Frame]:
+        """A message for a role of KINDS, STATIC or IMAGES; of an image its CDR bytes. Nothing that it holds is an error."""
+        if role in IMAGES:
+            try:
+                image = raw_image(IMAGES[role].type, message)
+            except ValueError as error:
+                self._refuse("unreadable", str(error))
+                return []
+            self._shots += self._source.image(image.stamp_ns, image)
+        else:
+            getattr(self, f"_take_{role}")(message)
+        return self._ready()
+
+    def restart(self) -> None:
+        """A new session; what waits is of the time before."""
+        self._source.restart()
+        self._shots.clear()
+
+    # -- messages ------------------------------------------------------------------------------------------------
+
+    def _take_pose(self, msg: Any) -> None:
+        T_odom_base = odometry_pose(msg)
+        if T_odom_base is None:
+            self._refuse("bad_pose", "an odometry message holds no pose")
+            return
+        self._heard.odom_frame, self._heard.base_frame = str(msg.header.frame_id), str(msg.child_frame_id)
+        self._shots += self._source.pose(ros.stamp_of(msg.header.stamp), T_odom_base)
+
+    def _take_points(self, msg: Any) -> None:
+        try:
+            points = points_from_message(msg)
+        except ValueError as error:
+            self._refuse("bad_points", str(error))
+            points = None
+        self._shots += self._source.points(ros.stamp_of(msg.header.stamp), points)
+
+    def _take_extrinsic(self, msg: Any) -> None:
+        T_base_cam = odometry_pose(msg)
+        if T_base_cam is None:
+            self._refuse("bad_pose", "an extrinsic holds no pose")
+        elif self._options.T_base_cam is None:
+            self._heard.T_base_cam = T_base_cam
+
+    def _take_camera(self, msg: Any) -> None:
+        if self._options.camera is None:
+            size = {"width": int(msg.width), "height": int(msg.height)}
+            K, D = np.array(msg.k, float), np.array(msg.d, float)
+            self._heard.camera = SimpleNamespace(k=K, d=D, distortion_model=str(msg.distortion_model), **size)
+
+    def _take_static(self, msg: Any) -> None:
+        self._heard.tree.hear(msg)
+
+    # -- frames --------------------------------------------------------------------------------------------------
+
+    def _ready(self) -> list[Frame]:
+        frames: list[Frame] = []
+        while self._shots:
+            shot, heard = self._shots[0], self._heard
+            T_base_cam = self._mount(shot)
+            if heard.camera is None or T_base_cam is None:
+                self._drop_surplus("no_camera_info" if heard.camera is None else "no_extrinsic")
+                break
+            self._shots.popleft()
+            at, T_odom_cam = shot.at, shot.at.T_odom_base @ T_base_cam
+            if self._selector is None or self._selector.takes(at.stamp_ns, at.session, T_odom_cam, at.pace):
+                who = (at.stamp_ns, at.session, self._next_id)
+                tail = (heard.odom_frame, self._options.metric, shot.points)
+                frames.append(Frame(*who, T_odom_cam, shot.image, heard.camera, *tail))
+                self._next_id += 1
+        return frames
+
+    def _mount(self, shot: Shot) -> SE3 | None:
+        """T_base_cam: as given, as the source told, the identity where both are one frame, else from /tf_static."""
+        if self._heard.T_base_cam is not None or self._options.kind != "odometry":
+            return self._heard.T_base_cam
+        base, cam = self._heard.base_frame, shot.image.frame
+        return self._heard.tree.between(base, cam) if base and cam else None
+
+    def _drop_surplus(self, reason: str) -> None:
+        while len(self._shots) > MOST_IMAGES or sum(len(s.image) for s in self._shots) > MOST_BYTES:
+            self._shots.popleft()
+            self._refuse(reason, self.missing)
+
+    @property
+    def missing(self) -> str:
+        """What waiting images wait for, in words; "" where none waits for more than poses."""
+        if not self._shots:
+            return ""
+        if self._heard.camera is None:
+            return "the camera's intrinsics are unknown: no camera info came, and no camera file is given"
+        base, cam = self._heard.base_frame, self._shots[0].image.frame
+        if self._options.kind == "odometry":
+            told = f"the place of the camera ('{cam}') on '{base}' is unknown"
+            return f"{told}: /tf_static does not tell it, and base_from_cam is not given"
+        return "the place of the camera is unknown: no extrinsic came, and base_from_cam is not given"
+
+    def _refuse(self, reason: str, detail: str) -> None:
+        self.refused[reason] += 1
+        self.detail[reason] = detail
+
+
+def keyframe_from_frame(frame: Frame, extract: Extract) -> tuple[Keyframe | None, Rejection | None]:
+    """What `keyframe_from_message` gives of a Keyframe message. Raises ConfigError where the extractor fails."""
+
+    def rejected(reason: str, detail: str) -> Rejection:
+        return Rejection(frame.id, frame.session, frame.stamp_ns, reason, detail)
+
+    camera, features, fault = frame.camera, NO_FEATURES, None
+    try:
+        image = pixels(frame.image)
+    except ValueError as error:
+        image, fault = None, rejected("no_features", f"the image cannot be used: {error}")
+    if image is not None:
+        camera = _camera_of(frame.camera, image)
+        if isinstance(camera, str):
+            fault = rejected("no_intrinsics", camera)
+        elif frame.points is not None and (words := disagreement(frame.points, frame.T_odom_cam, camera)):
+            return None, rejected("bad_pose", words)
+        else:
+            features = _features(extract, image)
+            if frame.points is not None:
+                xyz_cam = positions(frame.points, frame.T_odom_cam, features.uv)
+                features = Features(features.uv, features.descriptors, features.name, features.norm, xyz_cam=xyz_cam)
+    keyframe = Keyframe(
+        frame.stamp_ns,
+        frame.session,
+        frame.id,
+        frame.T_odom_cam,
+        camera if isinstance(camera, Camera) else None,
+        features,
+        frame.metric,
+        odom_frame=frame.odom_frame,
+        cam_frame=frame.image.frame,
+    )
+    return keyframe, fault
+
+
+def _camera_of(told: Any, image: np.ndarray) -> Camera | str:
+    height, width = image.shape[:2]
+    if not isinstance(told, Camera):
+        if (told.width, told.height) == (0, 0):
+            told = SimpleNamespace(**{**vars(told), "width": width, "height": height})
+        told = ros.camera_from_info(told)
+    if isinstance(told, Camera) and (told.width, told.height) != (width, height):
+        return f"the image has {width} x {height} px, its camera {told.width} x {told.height}"
+    return told
+
+
+def _features(extract: Extract, image: np.ndarray) -> Features:
+    try:
+        features = extract(image)
+    except Exception as error:  # foreign code, given by name
+        raise ConfigError(f"the extractor failed on an image ({error!r})") from error
+    if not isinstance(features, Features):
+        raise ConfigError(f"the extractor returned {type(features).__name__}, not xalign's Features")
+    return features
