@@ -41,3 +41,14 @@ def test_what_cannot_be_made_is_one_sentence(words, said, tmp_path: Path, capsys
     assert main(["simulate", "-o", str(output), *words]) == 1
     captured = capsys.readouterr()
     assert said in captured.err and captured.out == "" and not (tmp_path / "new").exists()
+
+
+def test_a_fault_is_in_the_log_and_the_truth_follows_its_stamps(tmp_path: Path, capsys) -> None:
+    assert main(["simulate", "-o", str(tmp_path / "f"), "--keyframes", "40", "--fault", "clock_back"]) == 0
+    stamps = [float(line.split()[0]) for line in (tmp_path / "f/truth.tum").read_text().splitlines()]
+    assert len(stamps) == 40 and stamps[-1] - stamps[0] > 900
+    run = [str(tmp_path / "f" / name) for name in ("run.mcap", "map.xmap", "truth.tum")]
+    capsys.readouterr()
+    assert main(["replay", run[0], "--map", run[1], "--truth", run[2], "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["keyframes_rejected"]["stamp_backwards"] > 0 and result["ate_rmse_m"] < 0.05

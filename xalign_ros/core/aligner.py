@@ -102,7 +102,7 @@ class Aligner:
             S, cov = predicted
             found = find_guided(keyframe, self.index, S.rigid_pose(), pose_covariance(S, cov), self.config)
             state = self.belief.judged(pose_covariance(S, cov))[0]
-            if isinstance(found, Anchor) or state is State.LOCALIZED:
+            if isinstance(found, Anchor) or (state is State.LOCALIZED and not self.belief.challenged):
                 self._sightings.clear()
                 return found
         elif self._prior is not None:

@@ -8,6 +8,7 @@ the camera leap while the odometry ran on smoothly looks like another place: a l
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -76,6 +77,12 @@ class Belief:
     @property
     def waiting(self) -> int:
         return sum(link.anchor is not None for link in self._links)
+
+    @property
+    def challenged(self) -> bool:
+        """Whether an anchor off the prediction waits since the last one that was believed: it may be the odometry that broke."""
+        since = itertools.takewhile(lambda link: not link.accepted, reversed(self._links))
+        return any(link.anchor is not None for link in since)
 
     def __len__(self) -> int:
         """Keyframes in the window."""

@@ -13,7 +13,7 @@ from xalign_ros.core.records import Estimate, Keyframe, RelativePose
 from xalign_ros.core.transforms import SE3, Sim3
 
 LEAP_RATIO = 3.0  # of a step over the usual one, beyond which the odometry leapt rather than moved
-LEAP_M, LEAP_RAD = 0.5, 0.6  # and at least this far: robots turn in corners, but two views half apart track nothing
+LEAP_M, LEAP_RAD = 0.5, 0.9  # and at least this far: robots turn in corners, but views that share nothing track nothing
 METRIC_WALK = 0.1  # part of metric_scale_sigma that a metric odometry's scale may wander per sqrt(m)
 
 

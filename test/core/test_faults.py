@@ -1,0 +1,44 @@
+"""Every fault once on a short run: what the table says must come of it. bench/faults.py has the seeds."""
+
+import numpy as np
+import pytest
+
+from xalign_ros.core.aligner import Aligner
+from xalign_ros.core.config import Config
+from xalign_ros.core.faults import FAULTS, faulty
+from xalign_ros.core.lie import so3_log
+from xalign_ros.core.map_building import build_map
+from xalign_ros.core.records import State
+from xalign_ros.core.simulation import driving, mapping, world
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    built = world("corridor", 0, 60)
+    map_ = build_map(mapping(built, 0), built.mapped, map_id="m", source="s", metric=True)
+    run = driving(built, 0, Config().odometry, metric=False)
+    return map_, run, {k.id: T for k, T in zip(run, built.driven, strict=True)}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_no_wrong_pose_is_localized_and_the_run_ends_localized(name, simulated) -> None:
+    map_, run, truth = simulated
+    aligner, errors = Aligner(map_), []
+    for _, keyframe in faulty(run, name, 0):
+        step = aligner.step(keyframe)
+        if step.correction is not None:
+            T, true = step.correction.T_map_cam, truth[step.correction.keyframe_id]
+            errors.append(np.linalg.norm(T.t - true.t))
+            if step.state.state is State.LOCALIZED:
+                assert errors[-1] < 0.5 and np.linalg.norm(so3_log(true.R.T @ T.R)) < np.deg2rad(5)
+    assert step.state.state is State.LOCALIZED and np.median(errors) < 0.01
+
+
+def test_the_same_seed_breaks_the_same_and_the_run_stays_as_it_was(simulated) -> None:
+    _, run, _ = simulated
+    for name in FAULTS:
+        one, two = ([(ns, k.id, k.stamp_ns, k.session) for ns, k in faulty(run, name, 3)] for _ in range(2))
+        assert one == two
+    assert [k.stamp_ns for k in run] == sorted({k.stamp_ns for k in run})
+    with pytest.raises(ValueError, match="'gremlins' is not one of swapped"):
+        faulty(run, "gremlins", 0)
