@@ -13,6 +13,7 @@ from xalign_ros.core.bundle import adjust
 from xalign_ros.core.errors import MapError
 from xalign_ros.core.pose_graph import LOSSES, Loss
 from xalign_ros.core.reconstruction import Reconstruction
+from xalign_ros.io.loss_option import loss_of
 from xalign_ros.io.reconstruction_files import read_reconstruction, write_reconstruction
 
 WIDTH = 2.0
@@ -26,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace an existing output")
     parser.add_argument(
         "--robust",
-        type=_loss,
+        type=loss_of(WIDTH),
         default=Loss("huber", WIDTH),
         metavar="LOSS[:WIDTH]",
         help=f"on each reprojection: {', '.join(LOSSES)}; WIDTH in standard deviations (default: huber:{WIDTH:g})",
@@ -36,14 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--hold-points", action="store_true", help="points stay, only poses move")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of words")
-
-
-def _loss(text: str) -> Loss:
-    name, _, width = text.partition(":")
-    try:
-        return Loss(name, float(width) if width else WIDTH)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def run(args: argparse.Namespace) -> None:

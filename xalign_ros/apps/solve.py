@@ -15,6 +15,7 @@ from xalign_ros.core.graph import Solution, solve
 from xalign_ros.core.graph_chordal import chordal
 from xalign_ros.core.pose_graph import LOSSES, Loss, PoseGraph
 from xalign_ros.io.g2o import ROTATION_INFO, read_g2o, write_g2o
+from xalign_ros.io.loss_option import loss_of
 
 WIDTH = 3.0
 
@@ -25,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace an existing output")
     parser.add_argument(
         "--robust",
-        type=_loss,
+        type=loss_of(WIDTH),
         default=Loss(),
         metavar="LOSS[:WIDTH]",
         help=f"loss of loop edges, those not from a vertex to the next number: {', '.join(LOSSES)}; "
@@ -39,14 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(default: vec)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of words")
-
-
-def _loss(text: str) -> Loss:
-    name, _, width = text.partition(":")
-    try:
-        return Loss(name, float(width) if width else WIDTH)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def run(args: argparse.Namespace) -> None:
