@@ -1,5 +1,7 @@
 """Every fault once on a short run: what the table says must come of it. bench/faults.py has the seeds."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -42,3 +44,9 @@ def test_the_same_seed_breaks_the_same_and_the_run_stays_as_it_was(simulated) ->
     assert [k.stamp_ns for k in run] == sorted({k.stamp_ns for k in run})
     with pytest.raises(ValueError, match="'gremlins' is not one of swapped"):
         faulty(run, "gremlins", 0)
+
+
+def test_the_document_has_every_fault() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text()
+    for name, fault in FAULTS.items():
+        assert f"| {name} | {fault.words} | {fault.must} |" in text

@@ -21,16 +21,15 @@ DARK = 20  # keyframes
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """`change` makes it of a run; `words` say what it is, `must` what the aligner has to make of it.
+    """`change` makes it of a run; `words` say what it is, `must` what the aligner should make of it.
 
-    Always: no pose over 0.5 m or 5 deg off is LOCALIZED, the run ends LOCALIZED, and the median error of its poses is
-    within 1.5 times the undisturbed run's, and 5 mm. relock: keyframes from the end of the fault on until LOCALIZED.
+    Whatever it is: no pose over 0.5 m or 5 deg off may be LOCALIZED, the run must end LOCALIZED, and the median error of
+    its poses be within 1.5 times the undisturbed run's, or 7.5 mm.
     """
 
     change: Callable[[Arrivals, np.random.Generator], Arrivals]
     words: str
     must: str
-    relock: int = 5
 
 
 def _swapped(run: Arrivals, rng: np.random.Generator) -> Arrivals:
@@ -105,19 +104,17 @@ def _dark(run: Arrivals, rng: np.random.Generator) -> Arrivals:
 
 
 FAULTS = {
-    "swapped": Fault(_swapped, "a fifth of the keyframes sees what another one saw", "is refused, not believed"),
+    "swapped": Fault(_swapped, "a fifth of the keyframes sees what another one saw", "refused, not believed"),
     "dropped": Fault(_dropped, "30 % of the keyframes never come", "goes on"),
-    "late": Fault(_late, "10 % come 2 s late", "are rejected as stamp_backwards"),
-    "duplicated": Fault(_duplicated, "20 % come twice", "the second is rejected"),
-    "reordered": Fault(_reordered, "40 % of neighbours change places", "the earlier one is rejected"),
-    "scale_step": Fault(
-        _scale_step, "half-way the odometry's unit shrinks by a third", "locks anew on the new scale", 25
-    ),
-    "restart": Fault(_restart, "half-way the odometry begins a new session", "LOST, then locked anew", 10),
-    "unmarked_restart": Fault(_unmarked_restart, "the same, and nobody says so", "locks anew where anchors agree", 25),
-    "clock_forward": Fault(_clock_forward, "half-way the clock jumps 1000 s ahead", "goes on, or locks anew", 10),
-    "clock_back": Fault(_clock_back, "half-way the clock jumps 1000 s back", "begins anew where it stays back", 25),
-    "dark": Fault(_dark, f"{DARK} keyframes without a feature", "coasts on the odometry", 10),
+    "late": Fault(_late, "10 % come 2 s late", "rejected: `stamp_backwards`"),
+    "duplicated": Fault(_duplicated, "20 % come twice", "rejected: `duplicate_id`"),
+    "reordered": Fault(_reordered, "40 % of neighbours change places", "rejected: `stamp_backwards`"),
+    "scale_step": Fault(_scale_step, "half-way the odometry's unit shrinks by a third", "locks anew on the new scale"),
+    "restart": Fault(_restart, "half-way the odometry begins a new session", "LOST, then locked anew"),
+    "unmarked_restart": Fault(_unmarked_restart, "the same, and nobody says so", "locks anew where anchors agree"),
+    "clock_forward": Fault(_clock_forward, "half-way the clock jumps 1000 s ahead", "goes on, or locks anew"),
+    "clock_back": Fault(_clock_back, "half-way the clock jumps 1000 s back", "begins anew where it stays back"),
+    "dark": Fault(_dark, f"{DARK} keyframes without a feature", "coasts on the odometry"),
 }
 
 
