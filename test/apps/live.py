@@ -122,6 +122,10 @@ class Observer:
             qos = QoSProfile(depth=1000, durability=latched)
             self.node.create_subscription(ros_types(kind), topic, self.received[topic].append, qos)
 
+    def hears(self):
+        """Whether every topic has somebody who sends; what was sent before that is not heard."""
+        return self.until(lambda: all(map(self.node.count_publishers, self.received)))
+
     def sender(self, topic, kind, reliable=True):
         """A publisher that somebody listens to."""
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT

@@ -158,6 +158,7 @@ def test_signal_ends_it_cleanly_amid_a_run(world, tmp_path, number):
 
 def test_state_is_latched_beats_and_is_honest_before_the_lock(world, tmp_path):
     with live.node(tmp_path, world.map), live.observer(**TOPICS) as me:
+        assert me.hears()
         assert me.until(lambda: me.received["state"])
         state = me.received["state"][0]
         assert (state.state, state.localized, state.keyframes) == (0, False, 0)
@@ -183,6 +184,7 @@ def test_late_joiner_gets_the_last_state(world, tmp_path):
 def test_malformed_messages_are_refused_and_the_run_goes_on(world, tmp_path):
     keyframes = world.run.keyframes
     with live.node(tmp_path, world.map) as node, live.observer(**TOPICS) as me:
+        assert me.hears()
         send = me.sender("keyframes", KEYFRAME)
         odometry = me.sender("odometry", ODOMETRY)
         for n, k in enumerate(keyframes[:30]):
@@ -237,6 +239,7 @@ def test_odometry_is_corrected_at_its_own_rate_while_steps_run(world, tmp_path):
         live.node(tmp_path, world.map, *arguments),
         live.observer(**TOPICS, odometry_corrected=ODOMETRY) as me,
     ):
+        assert me.hears()
         player = live.Process(
             tmp_path / "player.log", "replay", world.odometry_log, "--map", world.map, "--live", "--rate", 4
         )
