@@ -5,7 +5,7 @@ import pytest
 from message_samples import a_pose, both, covariance
 
 from xalign_ros.io import ros_fields as ros
-from xalign_ros.io.odometry_message import ODOMETRY, corrected_odometry, odometry_pose
+from xalign_ros.io.odometry_message import ODOMETRY, correct_odometry, odometry_pose
 
 STAMP = 1_700_000_000_987_654_321
 
@@ -30,7 +30,7 @@ def test_corrected_odometry(types, wire):
     msg = odometry(types, T, twist, twist_cov)
     np.testing.assert_allclose(odometry_pose(msg).matrix(), T.matrix(), atol=1e-15)
 
-    out = wire(corrected_odometry(types, msg, T_map_child, cov, scale, "map"), ODOMETRY)
+    out = wire(correct_odometry(msg, T_map_child, cov, scale, "map"), ODOMETRY)
     assert (ros.stamp_of(out.header.stamp), out.header.frame_id, out.child_frame_id) == (STAMP, "map", "base_link")
     np.testing.assert_allclose(odometry_pose(out).matrix(), T_map_child.matrix(), atol=1e-15)
     np.testing.assert_allclose(ros.covariance_from_ros(out.pose.covariance, T_map_child.R), cov, atol=1e-15)
@@ -38,7 +38,7 @@ def test_corrected_odometry(types, wire):
     np.testing.assert_array_equal(ros.xyz(out.twist.twist.angular), twist[3:])
     J = np.diag([scale] * 3 + [1.0] * 3)
     np.testing.assert_allclose(np.reshape(out.twist.covariance, (6, 6)), J @ twist_cov @ J, atol=1e-15)
-    assert corrected_odometry(types, msg, T_map_child, cov, scale, "map", "robot").child_frame_id == "robot"
+    assert correct_odometry(msg, T_map_child, cov, scale, "map", "robot").child_frame_id == "robot"
 
 
 @both

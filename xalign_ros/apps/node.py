@@ -17,7 +17,7 @@ import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
@@ -263,7 +263,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             node = XalignNode()
         if node.get_parameter("autostart").value:
             node.bring_up()
-        executor = SingleThreadedExecutor()
+        executor = EventsExecutor()
         executor.add_node(node)
         while not signals and not error:
             executor.spin_once(timeout_sec=LOOK_S)

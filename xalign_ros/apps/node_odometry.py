@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,12 +14,12 @@ from xalign_ros.apps.node_alignment import Answer, Carrier
 from xalign_ros.core.config import Config
 from xalign_ros.core.intake import Setback
 from xalign_ros.core.lie import Array
-from xalign_ros.core.odometry import edge_between, leaps, pose_covariance, predict, step_size
+from xalign_ros.core.odometry import edge_to, leaps, pose_covariance, predict, step_size
 from xalign_ros.core.records import AlignmentState, State
 from xalign_ros.core.status import judge, score
 from xalign_ros.core.transforms import SE3
-from xalign_ros.io.odometry_message import corrected_odometry, odometry_pose
-from xalign_ros.io.ros_fields import ros_types, stamp_of
+from xalign_ros.io.odometry_message import correct_odometry, odometry_pose
+from xalign_ros.io.ros_fields import stamp_of
 
 STEPS = 10  # of the odometry that say what a step of it is like
 EXTRAPOLATED_S = 1.0  # beyond the stamp of a keyframe at most
@@ -114,8 +115,7 @@ class OdometryCorrector:
 
     def _carried(self, carrier: Carrier, T_odom_child: SE3) -> tuple[SE3, Array]:
         """T_map_child by the correction; its covariance grows from the keyframe on as the model says."""
-        now = replace(carrier.keyframe, T_odom_cam=T_odom_child, cov_cam=None)
-        edge = edge_between(carrier.keyframe, now, carrier.S_map_odom.s, self._config.odometry)
+        edge = edge_to(carrier.keyframe, T_odom_child, carrier.S_map_odom.s, self._config.odometry)
         S, cov = predict(carrier.estimate, edge)
         return (carrier.S_map_odom @ T_odom_child).rigid_pose(), pose_covariance(S, cov)
 
@@ -125,7 +125,9 @@ class OdometryCorrector:
             return _Moment(stamp_ns, answer, carrier, T_odom, T_map, T_map, SE3(T_odom.R, s * T_odom.t), cov)
         moved = last.T_odom_child.inverse() @ T_odom
         moved = SE3(moved.R, s * moved.t)
-        smooth = self._slewed(last.smooth @ moved, T_map, (stamp_ns - last.stamp_ns) / 1e9)
+        smooth = T_map
+        if carrier is not last.carrier or last.smooth is not last.T_map_child:
+            smooth = self._slewed(last.smooth @ moved, T_map, (stamp_ns - last.stamp_ns) / 1e9)
         return _Moment(stamp_ns, answer, carrier, T_odom, T_map, smooth, last.scaled @ moved, cov)
 
     def _slewed(self, here: SE3, there: SE3, seconds: float) -> SE3:
@@ -140,15 +142,15 @@ class OdometryCorrector:
 
     def _messages(self, msg: Any, m: _Moment, scale: float, wanted: frozenset[str]) -> dict[str, Any]:
         frames = (self.map_frame, self._base_frame)
-        made = {"odometry_corrected": corrected_odometry(ros_types, msg, m.T_map_child, m.cov, scale, *frames)}
+        made = {}
         if "odometry_smooth" in wanted:
             behind = (m.smooth.inverse() @ m.T_map_child).log()  # what is kept back is in the covariance
             cov = m.cov + np.outer(behind, behind)
-            made["odometry_smooth"] = corrected_odometry(ros_types, msg, m.smooth, cov, scale, *frames)
+            made["odometry_smooth"] = correct_odometry(deepcopy(msg), m.smooth, cov, scale, *frames)
         if "odometry_scaled" in wanted and m.answer.state.metric_scale and not m.carrier.keyframe.metric_scale:
-            frames = (SCALED.format(msg.header.frame_id), self._base_frame)
-            made["odometry_scaled"] = corrected_odometry(ros_types, msg, m.scaled, m.cov, scale, *frames)
-        return made
+            scaled = (SCALED.format(msg.header.frame_id), self._base_frame)
+            made["odometry_scaled"] = correct_odometry(deepcopy(msg), m.scaled, m.cov, scale, *scaled)
+        return made | {"odometry_corrected": correct_odometry(msg, m.T_map_child, m.cov, scale, *frames)}
 
     # -- state and frames ----------------------------------------------------------------------------------------
 

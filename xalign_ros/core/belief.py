@@ -72,7 +72,7 @@ class Belief:
 
     def poses(self) -> tuple[tuple[int, SE3], ...]:
         """Of the window, T_map_cam by keyframe id, newest last; none without a lock."""
-        return tuple((key, S.rigid_pose()) for key, S in self._window.poses()) if self._window else ()
+        return self._window.poses() if self._window else ()
 
     @property
     def waiting(self) -> int:

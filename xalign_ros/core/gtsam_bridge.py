@@ -26,6 +26,11 @@ def from_gtsam(S: gtsam.Similarity3) -> Sim3:
     return Sim3(S.rotation().matrix(), S.translation() * s, s)
 
 
+def rigid_from_gtsam(S: gtsam.Similarity3) -> SE3:
+    """Sim3.rigid_pose of it, at half the price."""
+    return SE3(S.rotation().matrix(), S.translation() * S.scale())
+
+
 def edge_factor(edge: RelativePose, i: int, j: int) -> gtsam.NonlinearFactor:
     """Log(Z^-1 S_i^-1 S_j) with Z the odometry at unit scale: invariant to the map frame, scale a random walk."""
     return gtsam.BetweenFactorSimilarity3(i, j, to_gtsam(edge.T_i_j), gtsam.noiseModel.Diagonal.Sigmas(edge.sigmas))

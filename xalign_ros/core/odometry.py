@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,13 +25,20 @@ def edge_between(i: Keyframe, j: Keyframe, scale: float, config: Odometry) -> Re
     the growth of the source's own marginal covariance where it gives one: what it has at j beyond that of i carried over,
     since an old error of heading swings the far end of the path without being noise of this edge.
     """
-    T_i_j = i.T_odom_cam.inverse() @ j.T_odom_cam
-    walk = METRIC_WALK * config.metric_scale_sigma if j.metric_scale else config.scale_per_sqrt_m
-    variance = edge_variance(np.linalg.norm(T_i_j.t), scale, walk, config)
-    if i.cov_cam is not None and j.cov_cam is not None:
-        Ad = T_i_j.inverse().as_sim3().adjoint()[:6, :6]
-        variance[:6] = np.fmax(variance[:6], np.diag(j.cov_cam - Ad @ i.cov_cam @ Ad.T))  # NaN is unknown
-    return RelativePose(i.id, j.id, T_i_j, np.sqrt(variance))
+    edge = edge_to(i, j.T_odom_cam, scale, config, j.id)
+    if i.cov_cam is None or j.cov_cam is None:
+        return edge
+    Ad, sigmas = edge.T_i_j.inverse().as_sim3().adjoint()[:6, :6], edge.sigmas.copy()
+    growth = np.maximum(np.diag(j.cov_cam - Ad @ i.cov_cam @ Ad.T), 0.0)
+    sigmas[:6] = np.fmax(sigmas[:6], np.sqrt(growth))  # NaN is unknown
+    return RelativePose(i.id, j.id, edge.T_i_j, sigmas)
+
+
+def edge_to(i: Keyframe, T_odom_cam: SE3, scale: float, config: Odometry, j: int = -1) -> RelativePose:
+    """The same, by the model alone, to where the camera is now."""
+    T_i_j = i.T_odom_cam.inverse() @ T_odom_cam
+    walk = METRIC_WALK * config.metric_scale_sigma if i.metric_scale else config.scale_per_sqrt_m
+    return RelativePose(i.id, j, T_i_j, np.sqrt(edge_variance(np.linalg.norm(T_i_j.t), scale, walk, config)))
 
 
 def edge_variance(distance: ArrayLike, scale: float, walk: float, config: Odometry) -> Array:
@@ -44,7 +52,7 @@ def edge_variance(distance: ArrayLike, scale: float, walk: float, config: Odomet
 
 def step_size(T_i_j: SE3) -> tuple[float, float]:
     """Length (odometry units) and angle (rad) of a step."""
-    return float(np.linalg.norm(T_i_j.t)), float(np.arccos(np.clip((np.trace(T_i_j.R) - 1) / 2, -1, 1)))
+    return math.hypot(*T_i_j.t.tolist()), math.acos(min(max((float(T_i_j.R.trace()) - 1) / 2, -1.0), 1.0))
 
 
 def leaps(step: tuple[float, float], earlier: Sequence[tuple[float, float]], scale: float) -> bool:

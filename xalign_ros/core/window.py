@@ -6,10 +6,17 @@ import gtsam
 import numpy as np
 
 from xalign_ros.core.config import Config
-from xalign_ros.core.gtsam_bridge import anchor_factor, edge_factor, from_gtsam, prior_factor, to_gtsam
+from xalign_ros.core.gtsam_bridge import (
+    anchor_factor,
+    edge_factor,
+    from_gtsam,
+    prior_factor,
+    rigid_from_gtsam,
+    to_gtsam,
+)
 from xalign_ros.core.lie import Array
 from xalign_ros.core.records import Anchor, Estimate, RelativePose
-from xalign_ros.core.transforms import Sim3
+from xalign_ros.core.transforms import SE3, Sim3
 
 WEAK_ROTATION_RAD = 1.0
 WEAK_TRANSLATION = 1e3  # odometry units
@@ -80,12 +87,12 @@ class Window:
         self._newest = newest
         return Estimate(self._ids[-1], newest, (cov + cov.T) / 2)
 
-    def poses(self) -> tuple[tuple[int, Sim3], ...]:
-        """All keyframes of the window, id and S_map_i, as solved last, newest last."""
+    def poses(self) -> tuple[tuple[int, SE3], ...]:
+        """All keyframes of the window, id and T_map_cam, as solved last, newest last."""
         estimate = self._smoother.calculateEstimate()
         keys = sorted(estimate.keys())
         return tuple(
-            (id_, from_gtsam(estimate.atSimilarity3(key)))
+            (id_, rigid_from_gtsam(estimate.atSimilarity3(key)))
             for id_, key in zip(self._ids[-len(keys) :], keys, strict=True)
         )
 

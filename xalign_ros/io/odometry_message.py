@@ -10,7 +10,6 @@ from xalign_ros.core.lie import Array
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io import ros_fields as ros
 from xalign_ros.io.messages import QUAT_TOLERANCE
-from xalign_ros.io.ros_fields import Types
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 
@@ -23,23 +22,22 @@ def odometry_pose(msg: Any) -> SE3 | None:
     return SE3.from_quat(pose[3:], pose[:3])
 
 
-def corrected_odometry(
-    types: Types, msg: Any, T_map_child: SE3, cov_child: Array, scale: float, map_frame: str, child_frame: str = ""
+def correct_odometry(
+    msg: Any, T_map_child: SE3, cov_child: Array, scale: float, map_frame: str, child_frame: str = ""
 ) -> Any:
-    """`msg` in the map: the given pose, the twist's lengths times `scale` (metres per odometry unit).
+    """Puts `msg` itself into the map: the given pose, the twist's lengths times `scale` (metres per odometry unit).
 
     cov_child (6, 6) of T_map_child: rotation, translation, axes of child, rad and m. An empty child_frame is that of
-    `msg`.
+    `msg`. In place, since to make a message anew takes longer than all else here; gives `msg`.
     """
-    pose = ros.pose_with_covariance(types, ros.seven(T_map_child), ros.covariance_to_ros(cov_child, T_map_child.R))
-    D = np.r_[scale, scale, scale, 1.0, 1.0, 1.0]
-    covariance = D[:, None] * np.asarray(msg.twist.covariance, float).reshape(6, 6) * D
-    twist = types("geometry_msgs/msg/Twist")(
-        linear=ros.vector3(types, scale * ros.xyz(msg.twist.twist.linear)), angular=msg.twist.twist.angular
-    )
-    return types(ODOMETRY)(
-        header=ros.header(types, ros.stamp_of(msg.header.stamp), map_frame),
-        child_frame_id=child_frame or msg.child_frame_id,
-        pose=pose,
-        twist=types("geometry_msgs/msg/TwistWithCovariance")(twist=twist, covariance=covariance.ravel()),
-    )
+    msg.header.frame_id, msg.child_frame_id = map_frame, child_frame or msg.child_frame_id
+    at, turned, linear = msg.pose.pose.position, msg.pose.pose.orientation, msg.twist.twist.linear
+    at.x, at.y, at.z = T_map_child.t.tolist()
+    turned.x, turned.y, turned.z, turned.w = T_map_child.q_xyzw.tolist()
+    msg.pose.covariance = ros.covariance_to_ros(cov_child, T_map_child.R)
+    linear.x, linear.y, linear.z = scale * linear.x, scale * linear.y, scale * linear.z
+    covariance = np.array(msg.twist.covariance, float).reshape(6, 6)
+    covariance[:3] *= scale
+    covariance[:, :3] *= scale
+    msg.twist.covariance = covariance.ravel()
+    return msg

@@ -14,7 +14,7 @@ import importlib
 from array import array
 from collections.abc import Callable
 from dataclasses import is_dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ DISTORTION_MODELS = {
 SECOND_NS = 1_000_000_000
 
 
+@cache
 def ros_types(name: str) -> Any:
     """The rclpy class of a message: "xalign_msgs/msg/Anchor" -> xalign_msgs.msg.Anchor."""
     package, kind, cls = name.split("/")
