@@ -11,6 +11,7 @@ import argparse
 import signal
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,11 +27,12 @@ from rclpy.utilities import remove_ros_args
 
 from xalign_ros.apps.node_diagnostics import diagnostics_message, inputs, localization, resources
 from xalign_ros.apps.node_endpoints import LOSSY, QUEUE, STATIC, TEN
-from xalign_ros.apps.node_inputs import WARN_S, Inputs
+from xalign_ros.apps.node_inputs import Inputs
 from xalign_ros.apps.node_localizer import Localizer
 from xalign_ros.apps.node_parameters import declare_parameters, read_parameters, refuse_unknown, told_as
 from xalign_ros.apps.node_worker import BEAT_S
 from xalign_ros.core.errors import ConfigError, XalignError
+from xalign_ros.io.adapter import IMAGES
 from xalign_ros.io.frame_messages import TF
 from xalign_ros.io.messages import KEYFRAME
 from xalign_ros.io.odometry_message import ODOMETRY, odometry_pose
@@ -51,6 +53,7 @@ class XalignNode(LifecycleNode):
         self.localizer: Localizer | None = None
         self.fault: XalignError | None = None
         self._active = False
+        self._loading: Future[tuple[str, bool]] | None = None
         self._timers_running: list[Any] = []
         self._counted: dict[str, int] = {}
         given = self._parameter_overrides
@@ -91,10 +94,17 @@ class XalignNode(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         subscribe = self.inputs.subscribe
+        assert self.localizer is not None
         try:
             with told_as("a parameter cannot be used"):
-                subscribe("keyframes", KEYFRAME, QUEUE, KEYFRAME_BYTES, self._on_keyframe, raw=True)
-                subscribe("odometry", ODOMETRY, LOSSY, ODOMETRY_BYTES, self._on_odometry)
+                if self.localizer.source is None:
+                    put = self.localizer.put
+                    subscribe("keyframes", KEYFRAME, QUEUE, KEYFRAME_BYTES, put, raw=True, part="keyframes")
+                else:
+                    for ear in self.localizer.source.ears():
+                        take = partial(self.localizer.source.take, ear.role)
+                        subscribe(*ear.topic, ear.qos, ear.most_bytes, take, raw=ear.role in IMAGES, part=ear.part)
+                subscribe("odometry", ODOMETRY, LOSSY, ODOMETRY_BYTES, self._on_odometry, part="odometry")
                 subscribe("/tf_static", TF, STATIC, TREE_BYTES, self._on_static)
                 posed = "geometry_msgs/msg/PoseWithCovarianceStamped"
                 subscribe("initialpose", posed, TEN, ODOMETRY_BYTES, self._on_initialpose)
@@ -102,7 +112,6 @@ class XalignNode(LifecycleNode):
         except XalignError as error:
             self.inputs.close()
             return self._failed(error)
-        assert self.localizer is not None
         if self._live.publish_tf:
             steady = Clock(clock_type=ClockType.STEADY_TIME)
             period_s = 1 / self._live.tf_rate_hz
@@ -142,6 +151,8 @@ class XalignNode(LifecycleNode):
         if self.localizer is not None:
             self.localizer.close()
             self.localizer = None
+        if self._loading is not None and not self._loading.done():
+            self._loading.set_result(("the node was cleaned up meanwhile", False))
 
     def _failed(self, error: XalignError) -> TransitionCallbackReturn:
         self.fault = error
@@ -151,15 +162,10 @@ class XalignNode(LifecycleNode):
 
     # -- inputs --------------------------------------------------------------------------------------------------
 
-    def _on_keyframe(self, data: bytes) -> None:
-        assert self.localizer is not None
-        worker = self.localizer.worker
-        if not worker.put(data):
-            told = f"{worker.dropped} keyframes dropped so far: they come faster than they can be aligned"
-            self.get_logger().warning(told, throttle_duration_sec=WARN_S)
-
     def _on_odometry(self, msg: Any) -> None:
         assert self.localizer is not None
+        if self._live.source == "odometry" and self.localizer.source is not None:
+            self.localizer.source.take("pose", msg)
         made = self.localizer.odometry.take(msg, self.localizer.listened)
         if isinstance(made, tuple):
             self.inputs.refuse("odometry", *made)
@@ -170,6 +176,8 @@ class XalignNode(LifecycleNode):
     def _on_static(self, msg: Any) -> None:
         assert self.localizer is not None
         self.localizer.tree.hear(msg)
+        if self.localizer.source is not None:
+            self.localizer.source.take("static", msg)
 
     def _on_initialpose(self, msg: Any) -> None:
         assert self.localizer is not None
@@ -200,7 +208,7 @@ class XalignNode(LifecycleNode):
         except ConfigError as error:
             response.message = str(error)
             return response
-        answer: Future[tuple[str, bool]] = Future(executor=self.executor)
+        answer = self._loading = Future[tuple[str, bool]](executor=self.executor)
         self.localizer.load(path, lambda *told: answer.set_result(told))
         response.message, response.success = await answer
         self.get_logger().info(f"~/load_map: {response.message}")
@@ -235,11 +243,14 @@ class XalignNode(LifecycleNode):
         self._counted = {i.topic: i.received for i in found}
         now_ns, seen_ns = self.get_clock().now().nanoseconds, run.answer.state.stamp_ns
         behind_s = (now_ns - seen_ns) / 1e9 if seen_ns else float("nan")
+        missing = run.source.missing if run.source is not None else ""
         parts = {
             "localization": localization(
                 run.state, run.map.map_id, run.map.version, run.odometry.T_map_base, run.why_no_tf
             ),
-            "inputs": inputs(found, rates, self._live.silent_after_s, run.worker.dropped, behind_s, self._active),
+            "inputs": inputs(
+                found, rates, self._live.silent_after_s, run.worker.dropped, behind_s, self._active, missing
+            ),
             "resources": resources(run.pids, len(run.worker), run.answer.step_s, run.restarts),
         }
         message = diagnostics_message(now_ns, self.get_fully_qualified_name().lstrip("/"), run.map.map_id, parts)
@@ -278,7 +289,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for ending in (signal.SIGINT, signal.SIGTERM):
             signal.signal(ending, signal.SIG_IGN)  # the interpreter's last moments are open to them otherwise
     if error:
-        print(f"xalign_node: the worker failed\n{error}", file=sys.stderr)
+        print(f"xalign_node: {error}", file=sys.stderr)
     return 1 if error else 0
 
 

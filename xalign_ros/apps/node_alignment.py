@@ -13,11 +13,14 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from xalign_ros.core.aligner import Aligner
 from xalign_ros.core.config import Config
+from xalign_ros.core.errors import XalignError
 from xalign_ros.core.lie import Array
 from xalign_ros.core.odometry import step_size
 from xalign_ros.core.records import INPUT_REASONS, AlignmentState, Anchor, Correction, Estimate, Keyframe, State, Step
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3, Sim3
+from xalign_ros.io.adapter import Frame, keyframe_from_frame
+from xalign_ros.io.adapter_log import extractor_for
 from xalign_ros.io.messages import KEYFRAME, NO_FEATURES, keyframe_from_message
 from xalign_ros.io.ros_fields import covariance_from_ros, ros_types
 from xalign_ros.io.step_messages import step_messages
@@ -39,6 +42,8 @@ class Terms:
     T_base_cam: SE3 | None = None
     jump_m: float = 0.3
     jump_rad: float = 0.1
+    images: bool = False  # are the source, with `features` of them
+    features: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +74,9 @@ class Alignment:
     """One map, one odometry, by bytes."""
 
     def __init__(self, map_: ReferenceMap, terms: Terms) -> None:
+        """Raises ConfigError where the features of images cannot be had."""
         self.map, self._terms = map_, terms
+        self._extract = extractor_for(map_, terms.features) if terms.images else None
         self.map_frame = terms.frame_prefix + (terms.map_frame or map_.frame)
         self._keyframe_type = ros_types(KEYFRAME)
         self._odom_frame, self._cam_frame = "odom", ""
@@ -105,11 +112,17 @@ class Alignment:
     def map_points(self) -> bytes:
         return bytes(serialize_message(map_points_message(ros_types, self.map, self.map_frame)))
 
-    def take(self, data: bytes, views: frozenset[str]) -> Answer:
+    def take(self, data: bytes | Frame, views: frozenset[str]) -> Answer:
         """One keyframe, and those of VIEWS that somebody looks at."""
         start = time.perf_counter()
         try:
-            keyframe, fault = keyframe_from_message(deserialize_message(data, self._keyframe_type))
+            if isinstance(data, Frame):
+                assert self._extract is not None
+                keyframe, fault = keyframe_from_frame(data, self._extract)
+            else:
+                keyframe, fault = keyframe_from_message(deserialize_message(data, self._keyframe_type))
+        except XalignError as error:
+            return self._answer(refused=("no_features", str(error)))
         except Exception as error:  # of foreign bytes; what they make a deserializer raise has no list
             return self._answer(refused=("unreadable", f"a message of {len(data)} bytes: {error}"))
         if keyframe is not None:

@@ -54,20 +54,26 @@ def inputs(
     dropped: int,
     behind_s: float,
     active: bool,
+    missing: str,
 ) -> Status:
-    """`rates` in Hz; `behind_s` is the clock minus the newest keyframe's stamp, NaN before the first."""
-    level, told, values = OK, [], dict[str, Any]()
+    """`rates` in Hz; `behind_s` is the clock minus the newest keyframe's stamp, NaN before the first.
+
+    `missing` is what images wait for, in words.
+    """
+    level, told, values = (WARN, [missing], dict[str, Any]()) if missing else (OK, [], {})
+    found = list(found)
+    newest_s = {part: max(one.last_s for one in found if one.part == part) for part in {one.part for one in found}}
     for one in found:
         values[f"{one.topic}: rate_hz"] = f"{rates.get(one.topic, 0.0):.1f}"
         values[f"{one.topic}: received"] = one.received
         values |= {f"{one.topic}: refused as {reason}": n for reason, n in one.refused.items()}
-        silent_s = time.monotonic() - one.last_s
         if one.incompatible:
             level = ERROR
             told.append(f"a publisher of {one.topic} does not suit: QoS {one.incompatible}")
-        elif active and one.topic in ("keyframes", "odometry") and silent_s > silent_after_s:
+    for part, last_s in sorted(newest_s.items()):
+        if active and part and (silent_s := time.monotonic() - last_s) > silent_after_s:
             level = max(level, WARN)
-            told.append(f"no message for {silent_s:.0f} s on {one.topic}")
+            told.append(f"no message for {silent_s:.0f} s on {part}")
     if abs(behind_s) > CLOCK_S:
         level = max(level, WARN)
         told.append(f"the stamps are {behind_s:.0f} s behind the clock; use_sim_time?")

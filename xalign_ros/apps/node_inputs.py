@@ -28,6 +28,7 @@ class Input:
     received: int = 0
     refused: Counter[str] = field(default_factory=Counter)
     last_s: float = field(default_factory=time.monotonic)
+    part: str = ""  # of what must flow; topics of one part stand in for each other
     incompatible: str = ""  # the QoS policy by which a publisher cannot be heard
 
     def __str__(self) -> str:
@@ -45,10 +46,18 @@ class Inputs:
         self.of: dict[str, Input] = {}
 
     def subscribe(
-        self, topic: str, kind: str, qos: QoSProfile, most_bytes: int, take: Callable[[Any], None], raw: bool = False
+        self,
+        topic: str,
+        kind: str,
+        qos: QoSProfile,
+        most_bytes: int,
+        take: Callable[[Any], None],
+        raw: bool = False,
+        part: str = "",
     ) -> None:
         """`take` gets the message (its bytes if raw) unless it is larger than most_bytes or cannot be read."""
         found, cls = self.of.setdefault(topic, Input(topic)), ros_types(kind)
+        found.part = part
         found.last_s = time.monotonic()
 
         def arrived(data: bytes) -> None:

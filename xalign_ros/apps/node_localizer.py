@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,11 @@ from rclpy.node import Node
 
 from xalign_ros.apps.node_alignment import Answer, Terms
 from xalign_ros.apps.node_endpoints import GATED, make_publishers
-from xalign_ros.apps.node_inputs import Inputs
+from xalign_ros.apps.node_inputs import WARN_S, Inputs
 from xalign_ros.apps.node_odometry import OdometryCorrector, Slew
 from xalign_ros.apps.node_parameters import Live, told_as
 from xalign_ros.apps.node_process import MapProcess, OpenMap, ProcessDiedError
+from xalign_ros.apps.node_source import NodeSource
 from xalign_ros.apps.node_worker import BEAT_S, Worker
 from xalign_ros.core.config import Config
 from xalign_ros.core.errors import XalignError
@@ -29,6 +30,8 @@ from xalign_ros.io.messages import state_message
 from xalign_ros.io.ros_fields import SECOND_NS, ros_types
 from xalign_ros.io.view_messages import VIEWS, no_markers
 
+REVIVALS = 3  # of a process that dies, in a row
+
 
 class Localizer:
     """Made with its map open; `close` gives all of it back. Methods are for the executor's thread, those with _ the worker's."""
@@ -38,7 +41,9 @@ class Localizer:
         self._node, self._inputs, self._live = node, inputs, live
         self.base_frame = live.base_frame and live.frame_prefix + live.base_frame
         jump = live.jump_m, float(np.radians(live.jump_deg))
-        self._terms = Terms(config, live.map_frame, live.frame_prefix, live.T_base_cam, *jump)
+        options, images = live.of_source(), live.source != "keyframes"
+        self._fed = "image" if images else "keyframes"  # the topic that keyframes come of
+        self._terms = Terms(config, live.map_frame, live.frame_prefix, live.T_base_cam, *jump, images, live.features)
         self._process = MapProcess(live.map_within(live.map), self._terms)
         self.publishers: dict[str, Any] = {}
         try:
@@ -56,7 +61,8 @@ class Localizer:
         self._tf_ns, self._viewed_s = -1, 0.0
         self._points_sent = False
         self.restarts = 0
-        self.worker = Worker(self._take, self._beat)
+        self.worker = Worker(self._take, self._watch)
+        self.source = NodeSource(options, config.selection, self.put, inputs.refuse) if images else None
         self.worker.start()
 
     def close(self) -> None:
@@ -77,9 +83,17 @@ class Localizer:
     def state(self) -> AlignmentState:
         return self.odometry.state(self.answer)
 
+    def put(self, job: Sized) -> None:
+        """The bytes of a keyframe's message, or a frame."""
+        if not self.worker.put(job):
+            told = f"{self.worker.dropped} keyframes dropped so far: they come faster than they can be aligned"
+            self._node.get_logger().warning(told, throttle_duration_sec=WARN_S)
+
     def restart(self, reason: str) -> None:
         """With nothing known but the map; keyframes that wait are of the time before."""
         self.worker.clear()
+        if self.source is not None:
+            self.source.restart()
         self.odometry.restart()
         self._tf_ns = -1
         self.worker.order(lambda: self._ask("restart", reason))
@@ -140,7 +154,7 @@ class Localizer:
         self.map = opened
         self.answer = Answer(opened.state)
 
-    def _take(self, data: bytes) -> None:
+    def _take(self, data: Sized) -> None:
         views, now_s = frozenset[str](), time.monotonic()
         if now_s - self._viewed_s >= BEAT_S:
             views = frozenset(topic for topic in VIEWS if self.publishers[topic].get_subscription_count())
@@ -164,7 +178,7 @@ class Localizer:
         if answer.failure:
             log.error(f"a step failed, the alignment begins anew\n{answer.failure}")
         if answer.refused[0]:
-            self._inputs.refuse("keyframes", *answer.refused)
+            self._inputs.refuse(self._fed, *answer.refused)
         if answer.state.state != before.state.state:
             log.info(f"{answer.state.state.name}: {answer.state.reason}")
         if beat or answer.failure:
@@ -185,6 +199,11 @@ class Localizer:
         self._node.get_logger().info(f"the camera's place is that of /tf_static: '{base}' from '{answer.cam_frame}'")
         self._ask("mount", found)
 
+    def _watch(self) -> None:
+        if self._process.exitcode is not None:
+            self._revive(ProcessDiedError(f"exit code {self._process.exitcode}"))
+        self._beat()
+
     def _beat(self) -> None:
         m, a = self.map, self.answer
         message = state_message(ros_types, self.state, m.frame, a.odom_frame, m.map_id, m.version)
@@ -200,20 +219,30 @@ class Localizer:
         self._process.end()
         self._process, self._coming = coming, None
         self._use(opened)
-        self._begin_anew("the map was changed")
+        try:
+            self._begin_anew("the map was changed")
+        except ProcessDiedError as error:
+            self._revive(error)
         done(f"map '{opened.map_id}' version {opened.version}: {opened.points} points", True)
 
     def _revive(self, error: ProcessDiedError) -> None:
         self.restarts += 1
         self._node.get_logger().error(f"the alignment's process died ({error}); it is started anew")
         self._process.end()
-        self._process = MapProcess(self._process.path, self._terms)
-        self._use(self._process.opened())
-        self._begin_anew("the alignment's process died")
+        for _ in range(REVIVALS):
+            self._process = MapProcess(self._process.path, self._terms)
+            try:
+                self._use(self._process.opened())
+                self._begin_anew("the alignment's process died")
+                return
+            except ProcessDiedError as again:
+                self._process.end()
+                error = again
+        raise XalignError(f"the alignment's process dies as soon as it is started ({error})")
 
     def _begin_anew(self, reason: str) -> None:
         self._points_sent = False
         self.odometry.map_frame = self.map.frame
         if self._mounted is not None:
-            self._ask("mount", self._mounted)
-        self._ask("restart", reason)
+            self._process.call("mount", self._mounted)
+        self._tell(self._process.call("restart", reason), beat=True)

@@ -17,6 +17,8 @@ from rclpy.node import Node
 from xalign_ros.core.config import Config, option, options, with_options
 from xalign_ros.core.errors import ConfigError
 from xalign_ros.core.transforms import SE3
+from xalign_ros.io.adapter import SourceOptions
+from xalign_ros.io.camera_file import read_camera
 from xalign_ros.io.messages import QUAT_TOLERANCE
 from xalign_ros.io.ros_fields import ros_types
 
@@ -34,6 +36,10 @@ class Live:
     base_frame: str = option("", "", "child frame of odometry_corrected; empty: that of the odometry")
     frame_prefix: str = option("", "", "put before map_frame and base_frame; frames of messages stay as they come")
     base_from_cam: tuple[float, ...] = field(default=IDENTITY, metadata=SEVEN)
+    source: str = option("keyframes", "", "keyframes, or odometry, vins, openvins with images")
+    features: str = option("", "", "of images: extractor, or module:function; empty: that of the map")
+    camera: str = option("", "", "of images: calibration file, where no camera_info comes")
+    metric_scale: bool = option(False, "", "of source odometry: its unit is the metre")
     autostart: bool = option(True, "", "configure and activate at once; false: wait for a lifecycle manager")
     publish_tf: bool = option(True, "", "send map -> odom on /tf")
     tf_smooth: bool = option(False, "", "send the smooth pose's map -> odom instead of the raw one's")
@@ -52,6 +58,11 @@ class Live:
     def T_base_cam(self) -> SE3 | None:
         """None while it is the identity."""
         return SE3.from_quat(self.base_from_cam[3:], self.base_from_cam[:3]) if self.base_from_cam != IDENTITY else None
+
+    def of_source(self) -> SourceOptions:
+        """Raises ConfigError and FormatError."""
+        camera = read_camera(Path(self.camera)) if self.camera else None
+        return SourceOptions(self.source, self.features, camera, self.T_base_cam, self.metric_scale)
 
     @property
     def folder(self) -> Path:
@@ -97,7 +108,9 @@ def read_parameters(values: Mapping[str, Any]) -> tuple[Config, Live]:
     """From values by name; unknown names are left to `refuse_unknown`. Raises ConfigError."""
     names = [key for key, _, _ in options(Config())]
     config = with_options(Config(), {n: values[n] for n in names if n in values}, "the node's parameters")
-    return config, Live(**{name: _own(name, values[name]) for name in OWN if name in values})
+    live = Live(**{name: _own(name, values[name]) for name in OWN if name in values})
+    SourceOptions(live.source)
+    return config, live
 
 
 def _own(name: str, value: Any) -> Any:

@@ -18,6 +18,7 @@ from xalign_ros.core.records import AlignmentState
 from xalign_ros.io.xmap import read_map
 
 END_S = 5.0  # for the step in hand, when all ends
+HUNG_S = 30.0  # without an answer to a call; a step takes milliseconds, over the whole map a second
 
 
 class ProcessDiedError(Exception):
@@ -51,24 +52,33 @@ class MapProcess:
     def pid(self) -> int | None:
         return self._process.pid
 
+    @property
+    def exitcode(self) -> int | None:
+        """None while it lives."""
+        return self._process.exitcode
+
     def opened(self) -> OpenMap:
         """Waits for the map. Raises what reading it raises, and ProcessDiedError."""
-        result = self._result()
+        result = self._result(None)
         assert isinstance(result, OpenMap)
         return result
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """Alignment.name(*arguments) over there. Raises ProcessDiedError."""
+        """Alignment.name(*arguments) over there. Raises ProcessDiedError, also where there is no answer for HUNG_S."""
         try:
             self._pipe.send((name, arguments))
         except (OSError, ValueError) as error:
             raise ProcessDiedError(str(error)) from error
-        return self._result()
+        return self._result(HUNG_S)
 
-    def _result(self) -> Any:
+    def _result(self, patience_s: float | None) -> Any:
         try:
+            if not self._pipe.poll(patience_s):
+                self._process.kill()
+                raise ProcessDiedError(f"no answer for {patience_s:g} s")
             result = self._pipe.recv()
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError, TypeError) as error:  # TypeError: `end` came in between
+            self._process.join(END_S)
             raise ProcessDiedError(f"exit code {self._process.exitcode}") from error
         if isinstance(result, Exception):
             raise result

@@ -10,8 +10,9 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 
+from xalign_ros.core.errors import XalignError
 from xalign_ros.io.step_messages import KEYFRAME_QUEUE
 
 BEAT_S = 1.0  # between two beats
@@ -21,10 +22,10 @@ QUEUE_BYTES = 64 << 20  # that wait at most
 class Worker(threading.Thread):
     """Works on what was `put`, in order, orders first, and does `beat` once a second."""
 
-    def __init__(self, work: Callable[[bytes], None], beat: Callable[[], None]) -> None:
+    def __init__(self, work: Callable[[Sized], None], beat: Callable[[], None]) -> None:
         super().__init__(name="aligner", daemon=True)
         self._work, self._beat = work, beat
-        self._waiting: deque[bytes] = deque()
+        self._waiting: deque[Sized] = deque()
         self._orders: deque[Callable[[], None]] = deque()
         self._changed = threading.Condition()
         self._stopping = False
@@ -36,8 +37,8 @@ class Worker(threading.Thread):
         """Keyframes that wait."""
         return len(self._waiting)
 
-    def put(self, job: bytes) -> bool:
-        """False when older jobs had to go for it: KEYFRAME_QUEUE of them wait at most, and QUEUE_BYTES."""
+    def put(self, job: Sized) -> bool:
+        """len(job) are its bytes. False when older ones had to go for it: KEYFRAME_QUEUE wait at most, and QUEUE_BYTES."""
         with self._changed:
             before = self.dropped
             self._waiting.append(job)
@@ -78,8 +79,10 @@ class Worker(threading.Thread):
                 if time.monotonic() >= due and not self._stopping:
                     self._beat()
                     due = time.monotonic() + BEAT_S
+        except XalignError as error:
+            self.error = str(error)
         except Exception:  # nobody else would notice
-            self.error = traceback.format_exc()
+            self.error = f"the worker failed\n{traceback.format_exc()}"
 
     def _next(self, due: float) -> Callable[[], None] | None:
         with self._changed:
