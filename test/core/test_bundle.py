@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bundle_problems import CONSTANT_TRACKS, golden, of_the_table
 from graph_problems import GOLDEN
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -78,26 +79,11 @@ def snapshot(R, t, i, j, weights, **kw) -> PoseEdges:
 @needs_golden
 @pytest.mark.parametrize("name", ["se3", "scaleinv"])
 def test_golden(name) -> None:
-    z = np.load(GOLDEN / f"pytheia_golden_ba_{name}.npz")
-    f, cx, cy, width, height = z["intrinsics"]
-    R, X = so3_exp(z["aa0"]).swapaxes(1, 2), z["X0"][:, :3] / z["X0"][:, 3:]
-    view, track = z["obs"][:, :2].astype(int).T
-    a, k = z["anchor_idx"], len(z["anchor_idx"])
-    information = [
-        float(z[f"prior_{s}_sqrt"]) ** 2 * np.tile(np.eye(3), (k, 1, 1)) for s in ("orientation", "position")
-    ]
-    priors = PosePriors(a, z["anchor_R"].swapaxes(1, 2), z["anchor_c"], *information)
-    camera = Camera("radtan", [f, f, cx, cy], [], int(width), int(height))
-    r = reconstruction(R, z["c0"], X, view, track, z["obs"][:, 2:], [camera], priors)
-    w = {s: float(z[f"edge_{s}_sqrt"]) for s in ("rotation", "translation", "direction", "magnitude")}
-    weights = (
-        [w["rotation"], w["translation"], 0, 0] if name == "se3" else [w["rotation"], 0, w["direction"], w["magnitude"]]
-    )
-    edges = snapshot(R, z["c0"], np.arange(5), np.arange(1, 6), np.tile(weights, (5, 1)))
-    done = adjust(r, edges=[edges])
+    problem, z = golden(name)
+    done = problem.adjusted()
     assert done.initial_cost == pytest.approx(float(z["cost0"]), rel=1e-12) and done.skipped == 0
     assert done.converged and done.cost <= float(z["cost1"]) * (1 + 1e-6)
-    at_theirs, _ = edges_at(edges, so3_exp(z["aa1"]).swapaxes(1, 2), z["c1"])
+    at_theirs, _ = edges_at(problem.edges[0], so3_exp(z["aa1"]).swapaxes(1, 2), z["c1"])
     rows = slice(0, 6) if name == "se3" else slice(3, 10)
     np.testing.assert_allclose(at_theirs[:, rows], z["edge1"], atol=1e-9)
 
@@ -191,19 +177,10 @@ def test_a_point_that_lost_its_projections_is_put_where_its_rays_meet() -> None:
 @needs_golden
 def test_constant_tracks_far_from_their_start_end_below_pytheia() -> None:
     """1.5 m off at the start, points land behind cameras on the way; pyTheia's best of four runs ends at 11,957."""
-    z = np.load(GOLDEN / "pytheia_ba_n240.npz")
-    constant = np.arange(len(z["points_init"])) % 5 == 0
-    X = np.where(constant[:, None], z["points_gt"], z["points_init"])
-    f, cx, cy, width, height = z["intrinsics"]
-    view, track = z["obs"][:, :2].astype(int).T
-    k = len(z["anchor_idx"])
-    information = [w**2 * np.tile(np.eye(3), (k, 1, 1)) for w in (100, 20)]
-    priors = PosePriors(z["anchor_idx"], z["anchor_R"].swapaxes(1, 2), z["anchor_c"], *information)
-    camera = Camera("radtan", [f, f, cx, cy], [], int(width), int(height))
-    start = reconstruction(z["init_R"].swapaxes(1, 2), z["init_c"], X, view, track, z["obs"][:, 2:], [camera], priors)
-    done = adjust(start, constant_tracks=constant)
+    problem = of_the_table(240, CONSTANT_TRACKS)
+    done = problem.adjusted()
     assert done.cost < 8000 and done.skipped == 0
-    assert np.sqrt(((done.reconstruction.t - z["gt_c"]) ** 2).sum(axis=1).mean()) < 0.0075
+    assert problem.rmse(done.reconstruction.t) < 0.0075
 
 
 def test_an_edge_alone_carries_a_view_that_sees_nothing() -> None:

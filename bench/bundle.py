@@ -1,0 +1,152 @@
+"""Bundle adjustment beside pyTheia and pycolmap; exit 1 on a miss. bench/bundle.py [--only NAME] [--json]
+
+Names: golden, n60, n240 (cases of pyTheia's table), wall (400 views, 40,000 tracks).
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one thread each; before NumPy is imported
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from bundle_problems import CASES, CONSTANT_TRACKS, Bundle, along_a_wall, golden, of_the_table
+from case import Case, run
+
+from xalign_ros.core.bundle import Bundled
+from xalign_ros.io.colmap import write_model
+from xalign_ros.io.colmap_conversion import model_of_reconstruction
+
+PEER = Path(__file__).with_name("bundle_peer.py")
+CONSTANT_RMSE = {60: 0.0028, 240: 0.0075}  # m, with constant tracks
+Peer = Callable[[int, bool], dict[str, Any]]
+
+
+def golden_problems(case: Case) -> None:
+    for name in ("se3", "scaleinv"):
+        problem, z = golden(name)
+        done = problem.adjusted()
+        off = abs(done.initial_cost / float(z["cost0"]) - 1)
+        case.figure(f"{name}: initial cost, relative difference to pyTheia's", off, high=1e-12)
+        case.figure(f"{name}: final cost over pyTheia's", done.cost / float(z["cost1"]), high=1 + 1e-6)
+
+
+def of_table(n: int) -> Callable[[Case], None]:
+    """Each run beside both of pyTheia's parametrizations of points; the faster one counts."""
+
+    def case_of(case: Case) -> None:
+        ratios = []
+        for name in CASES:
+            problem = of_the_table(n, name)
+            with pytheia(problem) as peer:
+                ours, theirs, done, answer = beside(
+                    problem, lambda: [peer(1, True), peer(1, False)], 5 if n < 100 else 3
+                )
+            ratios.append(statistics.median(b / a for a, b in zip(ours, theirs, strict=True)))
+            case.figure(f"{name}: ms", 1e3 * statistics.median(ours))
+            case.figure(f"{name}: peer: pyTheia, ms", 1e3 * statistics.median(theirs))
+            case.figure(f"{name}: times faster", ratios[-1], low=2.5)
+            theirs_rmse = problem.rmse(np.array(answer["t"]))
+            case.figure(f"{name}: peer: pyTheia, cost", answer["cost"])
+            case.figure(f"{name}: cost", done.cost)
+            case.figure(f"{name}: peer: pyTheia, RMSE of cameras, m", theirs_rmse)
+            high = 1.01 * theirs_rmse
+            if name == CONSTANT_TRACKS:
+                high = min(high, CONSTANT_RMSE[n])
+            case.figure(f"{name}: RMSE of cameras, m", problem.rmse(done.reconstruction.t), high=high)
+        case.figure("times faster, median of the cases", statistics.median(ratios), low=3)
+
+    return case_of
+
+
+def wall(case: Case) -> None:
+    problem = along_a_wall(400, 40_000)
+    with pytheia(problem) as peer:
+        ours, theirs, done, answer = beside(problem, lambda: [peer(1, False), peer(2, False)], 3)
+    case.figure("tracks", len(problem.start.points))
+    case.figure("observations", done.observations)
+    case.figure("s", statistics.median(ours))
+    case.figure("peer: pyTheia, the faster of one and two threads, s", statistics.median(theirs))
+    case.figure("times faster", statistics.median(b / a for a, b in zip(ours, theirs, strict=True)), low=2.5)
+    case.figure("cost over pyTheia's", done.cost / answer["cost"], high=1 + 1e-6)
+    case.figure("RMSE of cameras, m", problem.rmse(done.reconstruction.t))
+    case.figure("peer: pyTheia, RMSE of cameras, m", problem.rmse(np.array(answer["t"])))
+    ours, theirs, done, answer = beside(problem, lambda: [colmap(problem, 1), colmap(problem, 2)], 3)
+    case.figure("peer: pycolmap, the faster of one and two threads, s", statistics.median(theirs))
+    case.figure("times faster than pycolmap", statistics.median(b / a for a, b in zip(ours, theirs, strict=True)))
+    case.figure("peer: pycolmap, RMSE of cameras, m", problem.rmse(np.array(answer["t"])))
+
+
+def beside(
+    problem: Bundle, peers: Callable[[], list[dict[str, Any]]], times: int
+) -> tuple[list[float], list[float], Bundled, dict[str, Any]]:
+    """Seconds of ours and of the faster peer, in turns; our result and the one of that peer with the lowest cost."""
+    ours, theirs, answers = [], [], []
+    for _ in range(times):
+        start = time.perf_counter()
+        done = problem.adjusted()
+        ours.append(time.perf_counter() - start)
+        answers += (found := peers())
+        theirs.append(min(answer["seconds"] for answer in found))
+    return ours, theirs, done, min(answers, key=lambda answer: float(answer["cost"]))
+
+
+@contextmanager
+def pytheia(problem: Bundle) -> Iterator[Peer]:
+    """Runs it, with so many threads and with homogeneous points or not, in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "problem.npz"
+        problem.for_pytheia(path)
+        command = [sys.executable, str(PEER), str(path)]
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        ) as process:
+            assert process.stdin is not None and process.stdout is not None
+
+            def ask(threads: int, homogeneous: bool) -> dict[str, Any]:
+                process.stdin.write(f"{threads} {int(homogeneous)}\n")
+                process.stdin.flush()
+                return dict(json.loads(process.stdout.readline()))
+
+            yield ask
+            process.stdin.close()
+
+
+def colmap(problem: Bundle, threads: int) -> dict[str, Any]:
+    """Reads the problem from a folder, which is not timed; setting up the adjuster is."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_model(model_of_reconstruction(problem.start), Path(folder) / "model", True)
+        model = pycolmap.Reconstruction(str(Path(folder) / "model"))
+    options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
+    options.refine_focal_length = options.refine_extra_params = options.print_summary = False
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.function_tolerance = 1e-6
+    images = sorted(model.images.values(), key=lambda image: int(image.name))
+    for image in images:
+        config.add_image(image.image_id)
+    held = problem.constant_views
+    for n in np.flatnonzero(held) if held is not None else ():
+        config.set_constant_rig_from_world_pose(images[n].frame_id)
+    start = time.perf_counter()
+    summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    seconds = time.perf_counter() - start
+    t = [image.projection_center().tolist() for image in images]
+    return {"seconds": seconds, "cost": 0.0, "t": t, "summary": summary}
+
+
+CASES_OF = {"golden": golden_problems, "n60": of_table(60), "n240": of_table(240), "wall": wall}
+
+if __name__ == "__main__":
+    sys.exit(run(__doc__, CASES_OF))
