@@ -13,7 +13,8 @@ import numpy as np
 
 from xalign_ros.core.bundle_factors import PoseEdges
 from xalign_ros.core.bundle_problem import Problem
-from xalign_ros.core.lie import project_rotation
+from xalign_ros.core.graph_band import SingularError
+from xalign_ros.core.lie import Array, project_rotation
 from xalign_ros.core.pose_graph import Loss
 from xalign_ros.core.reconstruction import Reconstruction
 
@@ -84,6 +85,55 @@ def adjust(
     adjusted = replace(reconstruction, R=project_rotation(at.R), t=at.t, points=points)
     m, skipped = len(problem.observations), problem.skipped + int(at.reprojections.lost.sum())
     return Bundled(adjusted, problem.start.cost, at.cost, iterations, converged, m, skipped)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covariances:
+    """Of views (V, 6, 6): rotation (rad) and translation, perturbation on the right of T_world_cam; of tracks (P, 3, 3).
+
+    Tracks are in world axes. Zero where constant, NaN where not estimated or where the observations leave it open.
+    """
+
+    views: Array
+    tracks: Array
+
+
+def covariances(
+    reconstruction: Reconstruction,
+    *,
+    edges: Sequence[PoseEdges] = (),
+    constant_views: np.ndarray | None = None,
+    constant_tracks: np.ndarray | None = None,
+    loss: Loss | None = None,
+    prior_loss: Loss | None = None,
+    down_world: Sequence[float] = DOWN,
+    gravity_as_cross: bool = True,
+) -> Covariances:
+    """Of an adjusted reconstruction, from what adjust() was given: blocks of the inverse of the whole normal matrix.
+
+    They are as true as sigma_px and the other weights. Raises ValueError where nothing holds the frame, and as adjust.
+    """
+    problem = Problem(
+        reconstruction, edges, constant_views, constant_tracks, loss, prior_loss, down_world, gravity_as_cross
+    )
+    at = problem.start
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        problem.system.build(at.reprojections, at.others, at.R)
+        try:
+            problem.system.reduce(0.0)
+            views, points = problem.system.covariances()
+        except SingularError:
+            raise ValueError(
+                "some view could move and no residual would change: hold the frame by constant views or tracks, or priors"
+            ) from None
+    turn = np.zeros_like(views)
+    turn[:, :3, :3] = turn[:, 3:, 3:] = at.R
+    views = np.swapaxes(turn, 1, 2) @ views @ turn
+    views[~reconstruction.estimated] = np.nan
+    tracks = np.empty_like(points)
+    tracks[problem.order] = points
+    tracks[~reconstruction.track_estimated] = np.nan
+    return Covariances(views, tracks)
 
 
 def _to_gain(*gains: float) -> float:

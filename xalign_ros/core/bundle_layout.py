@@ -11,7 +11,7 @@ import numpy as np
 from xalign_ros.core.graph_system import Scatter, system
 
 CHUNK = 64  # tracks eliminated at once
-BLOCK = 4096  # observations at once, or a few more: their intermediate values stay in the processor's cache
+BLOCK = 8192  # observations at once, or a few more: their intermediate values stay in the processor's cache
 TRIANGLE = np.tril_indices(6)
 SQUARE = np.divmod(np.arange(36), 6)
 NOBODY = np.zeros(0, np.int64)

@@ -11,13 +11,17 @@ from itertools import pairwise
 import numpy as np
 
 from xalign_ros.core.bundle_factors import Linear
-from xalign_ros.core.bundle_layout import TRIANGLE, Layout, Ties
+from xalign_ros.core.bundle_layout import TRIANGLE, Chunk, Layout, Ties
 from xalign_ros.core.bundle_observations import Linearized
+from xalign_ros.core.graph_band import SingularError
 from xalign_ros.core.graph_losses import Stage, weigh
 from xalign_ros.core.graph_system import Scatter
 from xalign_ros.core.lie import Array
 
 LEAST = 1e-12  # of a point's curvature, as a part of the largest
+FREE = 1e-11  # a pivot that so little is left of is rounding
+UNKNOWN = 1e-10  # curvature of a direction of a point, as a part of the largest, that says nothing
+ROWS, COLUMNS = np.tril_indices(3)
 SYMMETRIC = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # rows of a symmetric matrix of which six numbers are kept
 
 
@@ -89,9 +93,15 @@ class Reduced:
         self._rhs = rhs = np.zeros((self.count + 1, 6))
         rhs[: self.count] = -self.g
         zg = np.stack(_lower(L, self.gx))
-        for block in self._layout.blocks if self.count else ():
-            at = slice(block.rows.start, block.rows.stop)
-            Z = _whitened(self._at.A[:, at], self._at.D[:, at], L.take(self.track[at], axis=1))
+        for chunk, B in self._whitened() if self.count else ():
+            s.flat[chunk.into] -= (B.T @ B).reshape(-1)[chunk.take]
+            rhs[chunk.nodes] += (zg[:, chunk.tracks].reshape(-1) @ B).reshape(6, -1).T
+
+    def _whitened(self) -> Iterator[tuple[Chunk, Array]]:
+        """Of each chunk its matrix of W L^T."""
+        for block in self._layout.blocks:
+            at = block.rows
+            Z = _whitened(self._at.A[:, at], self._at.D[:, at], self.L.take(self.track[at], axis=1))
             for chunk in block.chunks:
                 n, tracks = len(chunk.nodes), chunk.tracks.stop - chunk.tracks.start
                 rows = slice(chunk.rows.start - at.start, chunk.rows.stop - at.start)
@@ -99,9 +109,7 @@ class Reduced:
                 for c, column in enumerate(Z):
                     for a, values in enumerate(column):
                         flat[(6 * c * tracks + a) * n :][chunk.at] = values[rows]
-                B = flat.reshape(3 * tracks, 6 * n)
-                s.flat[chunk.into] -= (B.T @ B).reshape(-1)[chunk.take]
-                rhs[chunk.nodes] += (zg[:, chunk.tracks].reshape(-1) @ B).reshape(6, n).T
+                yield chunk, flat.reshape(3 * tracks, 6 * n)
 
     def step(self) -> tuple[Array, Array]:
         """Steps of views (V, 6) and points (P, 3). Raises SingularError."""
@@ -125,22 +133,64 @@ class Reduced:
         points = np.stack([L[0] * x + L[1] * y + L[3] * z, L[2] * y + L[4] * z, L[5] * z], axis=1)
         return views[self.node], -points
 
+    def covariances(self) -> tuple[Array, Array]:
+        """Of views (V, 6, 6) and points (P, 3, 3), after reduce(0); zeros where they are constant, NaN where unknown.
+
+        A point's is L^T (1 + Z^T C Z) L with Z = W L^T and C that of the views that see it, all of whose blocks have
+        their places in the system. Raises SingularError where the frame is free.
+        """
+        s, views = self._layout.system, np.zeros((self.count + 1, 6, 6))
+        inner = np.zeros((len(self.free), 3, 3))
+        if self.count:
+            pivots = s.diagonal(np.arange(self.count))[:, np.flatnonzero(TRIANGLE[0] == TRIANGLE[1])]
+            before = s.flat[pivots]
+            s.factor()
+            if (s.flat[pivots] ** 2 < FREE * before).any():
+                raise SingularError
+            blocks = np.zeros_like(s.flat)
+            views[:-1] = s.marginals(blocks)
+            for chunk, B in self._whitened():
+                C = np.zeros((B.shape[1], B.shape[1]))
+                C.reshape(-1)[chunk.take] = blocks[chunk.into]
+                C += np.tril(C, -1).T + np.triu(C, 1).T
+                columns = B.reshape(3, -1, B.shape[1])
+                inner[chunk.tracks] = np.einsum("akn,bkn->kab", columns @ C, columns)
+        L = np.zeros_like(inner)
+        L[:, ROWS, COLUMNS] = self.L.T
+        points = np.swapaxes(L, 1, 2) @ (np.eye(3) + inner) @ L
+        points[self.free & ~self._known(self.L)] = np.nan
+        return views[self.node], points
+
+    def _known(self, L: Array) -> np.ndarray:
+        """Whether points have no open direction."""
+        size = np.einsum("kp,kp->p", L, L)
+        return np.asarray((size > 0) & (size * float(self.h.max(initial=0)) < 1 / UNKNOWN))
+
     def _inverse_factors(self, damping: float) -> Array:
         """Of the points' blocks, damped: L (6, P), lower triangles row by row, with the inverse L^T L."""
-        d, h = 1 + damping, self.h
-        floor = LEAST * max(float(h.max(initial=0)), 1e-300)
-        with np.errstate(invalid="ignore", divide="ignore"):  # closed Cholesky factors, then their inverses
-            a = np.sqrt((h[0] + floor) * d)
-            b, c = h[1] / a, h[2] / a
-            e = np.sqrt((h[3] + floor) * d - b * b)
-            f = (h[4] - c * b) / e
-            i = np.sqrt((h[5] + floor) * d - c * c - f * f)
-            L = np.empty((6, len(a)))
-            L[0], L[2], L[5] = 1 / a, 1 / e, 1 / i
-            L[1], L[4] = -b * L[0] * L[2], -f * L[2] * L[5]
-            L[3] = -(c * L[0] + f * L[1]) * L[5]
+        least = LEAST * max(float(self.h.max(initial=0)), 1e-300)
+        L = _inverse_factor(self.h, damping, least if damping else 0.0)
+        if not damping:  # what is added for points with an open direction must not hold the frame
+            open_ = ~self._known(L)
+            L[:, open_] = _inverse_factor(self.h[:, open_], damping, least)
         L[:, ~(self.free & np.isfinite(L).all(axis=0))] = 0.0
         return L
+
+
+def _inverse_factor(h: Array, damping: float, least: float) -> Array:
+    """Closed Cholesky factors of symmetric matrices (6, P) with a larger diagonal, then their inverses."""
+    d = 1 + damping
+    with np.errstate(invalid="ignore", divide="ignore"):
+        a = np.sqrt((h[0] + least) * d)
+        b, c = h[1] / a, h[2] / a
+        e = np.sqrt((h[3] + least) * d - b * b)
+        f = (h[4] - c * b) / e
+        i = np.sqrt((h[5] + least) * d - c * c - f * f)
+        L = np.empty((6, len(a)))
+        L[0], L[2], L[5] = 1 / a, 1 / e, 1 / i
+        L[1], L[4] = -b * L[0] * L[2], -f * L[2] * L[5]
+        L[3] = -(c * L[0] + f * L[1]) * L[5]
+    return L
 
 
 def _turned(A: Array, d: Array) -> list[list[Array]]:

@@ -71,8 +71,10 @@ class Band:
         x = x.reshape(g.shape)
         return np.asarray(x if self.place is None else x[self.place])
 
-    def marginals(self) -> Array:
+    def marginals(self, all_blocks: Array | None = None) -> Array:
         """Diagonal blocks (N, d, d) of H^-1 after factor(), by recursion from the last node back.
+
+        all_blocks, flat, takes the blocks of H^-1 that have a place in H, in these places.
 
         With L = [[L_n, 0], [B, L_rest]] the block of n is L_n^-T L_n^-1 + G S G^T, G = -L_n^-T B^T, S that of the
         width following nodes (Bjorck, "Numerical Methods for Least Squares Problems", section 6.7).
@@ -90,6 +92,10 @@ class Band:
             G = -T.T @ block[d : d + inside].T
             cross = G @ S[:inside, :inside]
             out[n] = T.T @ T + cross @ G.T
+            if all_blocks is not None:
+                for c, beyond in enumerate(cross):
+                    column = np.r_[out[n, c:, c], beyond]
+                    all_blocks.reshape(self.H.shape)[n, c, : len(column)] = column
             if reach:
                 keep = min(inside, reach - d)
                 S_next = np.zeros((reach, reach))

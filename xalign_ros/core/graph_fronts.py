@@ -147,8 +147,10 @@ class Fronts:
             own[:] = blas.dtrsv(D, own - x[f.below].reshape(-1) @ B, lower=1, trans=1)
         return np.asarray(x[self.place])
 
-    def marginals(self) -> Array:
+    def marginals(self, all_blocks: Array | None = None) -> Array:
         """Diagonal blocks (N, d, d) of H^-1 after factor(), from the last front back.
+
+        all_blocks, flat, takes the blocks of H^-1 that have a place in H, in these places.
 
         With L = [[D, 0], [B, L_rest]] and G = -B D^-1 the block of a front is D^-T D^-1 + G^T S G, S that of the nodes
         below, and they are all in its parent's front (Bjorck, "Numerical Methods for Least Squares Problems", 6.7).
@@ -172,6 +174,8 @@ class Fronts:
             Z[:w, :w] = T.T @ T + G.T @ Z[w:, :w]
             own = Z[:w, :w].reshape(f.w, d, f.w, d)
             out[f.first : f.first + f.w] = own[np.arange(f.w), :, np.arange(f.w)]
+            if all_blocks is not None:
+                all_blocks[f.own_at : f.own_at + (w + k) * w] = np.r_[Z[:w, :w].T.ravel(), Z[w:, :w].T.ravel()]
             whole[n] = Z
             if self._children[n]:
                 continue
