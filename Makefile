@@ -43,9 +43,9 @@ $(STAMP):
 	@$(PY) -m pip install -q --disable-pip-version-check uv==0.13.8
 	@echo 'setup: ROS 2 and solver wheels (about 1.1 GB installed), compiling the messages; half a minute on a good line'
 	@# reinstall: uv would take the messages of an earlier build from its cache. pip: knows mirrors that uv does not.
-	@$(VENV)/bin/uv pip install -q --python $(PY) --reinstall-package xalign-msgs ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,test]' \
+	@$(VENV)/bin/uv pip install -q --python $(PY) --reinstall-package xalign-msgs ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,batch,test]' \
 	  || { echo 'setup: once more with pip' >&2; $(PY) -m pip install -q -U pip \
-	       && $(PY) -m pip install -q ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,test]'; }
+	       && $(PY) -m pip install -q ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,batch,test]'; }
 	@rm -f $(VENV)/.done-*
 	@touch $@
 	@echo 'setup: done'
@@ -63,7 +63,7 @@ check: $(STAMP)
 
 bench: $(STAMP)
 	$(PY) -m pip install -q pytheia==1.2.1 faiss-cpu
-	@missed=0; for name in main_job faults anchors posegraph graph bundle; do $(PY) bench/$$name.py || missed=1; done; exit $$missed
+	@missed=0; for name in main_job batch live logs faults anchors posegraph graph bundle; do $(PY) bench/$$name.py || missed=1; done; exit $$missed
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info demo_report .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -61,6 +61,8 @@ setup(
             "pyyaml>=6,<7",
             "pillow>=10",  # sizes of images; matplotlib needs it anyway
         ],
+        # Many logs at once: processes of this machine, or a cluster.
+        "batch": ["dask>=2025.1,<2027", "distributed>=2025.1,<2027"],
         # Exact where another version formats or complains differently. The name `test` makes colcon test use pytest.
         "test": [
             "pytest>=8.3,<10",

@@ -244,7 +244,9 @@ def test_commands():
 
 
 # Import name -> name in package.xml and of the pip distribution, where they differ. None: rosdep has no key.
-ROSDEP = {name: None for name in ("gtsam", "poselib", "mcap", "zstandard", "rosbags", "rich")} | {
+ROSDEP = {
+    name: None for name in ("gtsam", "poselib", "mcap", "zstandard", "rosbags", "rich", "dask", "distributed")
+} | {
     "PIL": "python3-pil",
     "cv2": "python3-opencv",
     "h5py": "python3-h5py",
@@ -274,7 +276,9 @@ def test_what_the_code_imports_is_declared():
     assert {ROSDEP.get(name, name) for name in used} - {None} <= ros
 
     pip = {
-        re.split(r"[^\w-]", line)[0].lower() for line in requires("xalign_ros") if re.search(r"extra == .algo", line)
+        re.split(r"[^\w-]", line)[0].lower()
+        for line in requires("xalign_ros")
+        if re.search(r"extra == .(algo|batch)", line)
     }
     assert {DISTRIBUTION.get(name, name) for name in used & set(ROSDEP)} <= pip
 

@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from xalign_ros.core.aligner import Aligner
-from xalign_ros.core.config import Config
-from xalign_ros.core.errors import MapError
-from xalign_ros.core.graph import solve
-from xalign_ros.core.intake import in_chain
-from xalign_ros.core.odometry import edge_between
-from xalign_ros.core.pose_graph import PoseGraph
-from xalign_ros.core.records import Keyframe, Step
-from xalign_ros.core.reference_map import ReferenceMap
-from xalign_ros.core.run_graph import run_graph
-from xalign_ros.io.adapter_log import Chosen, add_source_arguments, log_keyframes, read_source
+from xalign_ros.apps.batch_cluster import on_cluster
+from xalign_ros.apps.batch_log import Job, failed, work
+from xalign_ros.core.errors import ConfigError, FormatError, LogError
+from xalign_ros.io.adapter_log import Chosen, add_source_arguments, read_source
 from xalign_ros.io.config_file import read_config
-from xalign_ros.io.log import Log
-from xalign_ros.io.tum import Trajectory, write_tum
+from xalign_ros.io.finished import Row
+from xalign_ros.io.overview import write_overview
+from xalign_ros.io.progress_bar import progress_bar
 from xalign_ros.io.xmap import read_map
+
+LOGS = (".mcap", ".bag", ".db3")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,8 +27,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "logs", type=Path, nargs="+", metavar="LOG", help="mcap files, rosbag2 folders or rosbag1 files"
     )
     parser.add_argument("--map", type=Path, required=True, metavar="MAP", help="reference map (.xmap folder)")
+    told = "folder for LOG.tum and LOG.json, overview.csv and overview.html; what is finished there is not done again"
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help=told)
+    parser.add_argument("--workers", type=int, metavar="N", help="processes of this machine (default: its cores)")
     parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder for LOG.tum and LOG.json"
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster that runs already, like tcp://host:8786"
     )
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with options that differ from the defaults")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one option; may be repeated")
@@ -44,62 +42,64 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """One log after the other; each is read through before anything is written for it."""
+    """Raises XalignError on what concerns all logs, and where none of them could be done; else each has its own row."""
+    if args.workers is not None and (args.workers < 1 or args.scheduler):
+        raise ConfigError("--workers must be at least 1, and is for this machine: not beside --scheduler")
     config, map_ = read_config(args.config, args.set), read_map(args.map, verify=True)
     source, chosen = read_source(args), Chosen(args.keyframe_topic, args.image_topic)
-    names = [log.stem for log in args.logs]
-    if len(set(names)) < len(names):
-        raise MapError(f"two logs are named {max(names, key=names.count)}; their results would overwrite each other")
-    results = {}
-    for path, name in zip(args.logs, names, strict=True):
-        with Log(path) as log:
-            run_ = [(k, fault) for _, k, fault in log_keyframes(log, source, config.selection, map_, chosen)]
-        trajectory, result = smooth(run_, map_, config)
+    names = _names(args.logs)
+    try:
         args.output.mkdir(parents=True, exist_ok=True)
-        write_tum(args.output / f"{name}.tum", trajectory)
-        (args.output / f"{name}.json").write_text(json.dumps(result) + "\n")
-        results[name] = result
-        if not len(trajectory):
-            print(f"{path}: never locked, so no keyframe has a pose", file=sys.stderr)
+    except OSError as error:
+        raise FormatError(f"{args.output} cannot be the folder of the results: {error.strerror}") from error
+    folder, where = args.output.resolve(), args.map.resolve()
+    jobs = [
+        Job(log.resolve(), name, folder, where, map_.version, config, source, chosen)
+        for log, name in zip(args.logs, names, strict=True)
+    ]
+    rows: dict[str, Row] = {}
+    for n, row in progress_bar(_rows(jobs, names, args.workers, args.scheduler), "smoothing logs", len(jobs)):
+        rows[names[n]] = row
+        print(f"[{len(rows)}/{len(jobs)}] {names[n]}: {_in_words(row)}", file=sys.stderr)
+    rows = {name: rows[name] for name in names}
+    write_overview(folder, rows, map_)
+    lost = [row["words"] for row in rows.values() if row["status"] == "failed"]
+    if len(lost) == len(rows):
+        raise LogError(
+            lost[0] if len(lost) == 1 else f"none of the {len(lost)} logs could be done; the first: {lost[0]}"
+        )
+    if lost:
+        print(f"{len(lost)} of {len(rows)} logs failed: {folder / 'overview.csv'} says why", file=sys.stderr)
     if args.json:
-        print(json.dumps(results))
+        print(json.dumps(rows))
         return
-    for name, result in results.items():
-        print(f"{name}: " + "  ".join(f"{key} {value}" for key, value in result.items()))
+    for name, row in rows.items():
+        print(f"{name}: " + "  ".join(f"{key} {value}" for key, value in row.items() if value not in (None, "")))
 
 
-def smooth(
-    run_: list[tuple[Keyframe | None, Any]], map_: ReferenceMap, config: Config
-) -> tuple[Trajectory, dict[str, Any]]:
-    """Anchors by the causal aligner, then one pose graph per odometry session that locked."""
-    aligner = Aligner(map_, config)
-    sessions: dict[int, list[tuple[Keyframe, Step]]] = {}
-    for keyframe, fault in run_:
-        step = aligner.step(keyframe, fault)
-        if keyframe is not None and (step.rejection is None or in_chain(step.rejection)):
-            sessions.setdefault(keyframe.session, []).append((keyframe, step))
-    stamps, poses, anchors = [], [], 0
-    for chain in sessions.values():
-        if any(step.correction for _, step in chain):
-            graph = _graph(chain, config)
-            stamps += [k.stamp_ns for k, _ in chain]
-            poses += [S.rigid_pose() for S in solve(graph).S]
-            anchors += len(graph.anchors or ())
-    rising, order = np.unique(np.array(stamps, np.int64), return_index=True)
-    R, t = np.array([T.R for T in poses]).reshape(-1, 3, 3), np.array([T.t for T in poses]).reshape(-1, 3)
-    result = {"keyframes": len(run_), "poses": len(poses), "sessions": len(sessions), "anchors": anchors}
-    return Trajectory(rising, R[order], t[order]), result
+def _rows(
+    jobs: Sequence[Job], names: Sequence[str], workers: int | None, scheduler: str | None
+) -> Iterator[tuple[int, Row]]:
+    """Of each job by its place, as they are done; a single log is not worth a cluster of our own."""
+    if len(jobs) == 1 and scheduler is None:
+        yield 0, work(jobs[0])
+        return
+    count = min(workers or os.cpu_count() or 1, len(jobs))
+    for n, row in on_cluster(work, jobs, names, count, scheduler):
+        yield n, failed(jobs[n], f"{jobs[n].log}: {row}") if isinstance(row, str) else row
 
 
-def _graph(chain: list[tuple[Keyframe, Step]], config: Config) -> PoseGraph:
-    """Start values from the correction of each keyframe, before the first one from that; all anchors ever believed."""
-    known = next(step.correction.S_map_odom for _, step in chain if step.correction)
-    start, edges = [], []
-    for n, (keyframe, step) in enumerate(chain):
-        known = step.correction.S_map_odom if step.correction else known
-        start.append(known @ keyframe.T_odom_cam)
-        if n:
-            edges.append(edge_between(chain[n - 1][0], keyframe, known.s, config.odometry))
-    believed = {a.keyframe_id: a for _, step in chain for a in (*step.believed, step.anchor) if a is not None}
-    keys = [k.id for k, _ in chain]
-    return run_graph(keys, start, edges, sorted(believed.items()), config, metric=chain[0][0].metric_scale)
+def _names(logs: Sequence[Path]) -> list[str]:
+    names = [log.stem if log.suffix in LOGS else log.resolve().name for log in logs]
+    if len(set(names)) < len(names):
+        raise LogError(f"two logs are named {max(names, key=names.count)}; their results would overwrite each other")
+    return names
+
+
+def _in_words(row: Row) -> str:
+    if row["status"] == "failed" or not row["poses"]:
+        return str(row["words"])
+    told = "finished before, nothing has changed since; " if row["status"] == "unchanged" else ""
+    return (
+        f"{told}{row['poses']} of {row['keyframes']} keyframes have a pose, to {row['position_sigma_m']:.3g} m (median)"
+    )
