@@ -73,3 +73,11 @@ def test_the_same_rooms_are_never_locked_on_alone() -> None:
         if step.correction is not None:
             assert np.linalg.norm(step.correction.T_map_cam.t - T.t) < 0.2
     assert step.state.state is State.LOCALIZED
+
+
+def test_denser_walls_and_more_features() -> None:
+    usual, dense = world("hall", 2, 10), world("hall", 2, 10, density=3.0)
+    assert len(dense.points) == 3 * len(usual.points)
+    run = driving(dense, 2, Config().odometry, metric=True, features=400, period_ns=100_000_000)
+    assert run[1].stamp_ns - run[0].stamp_ns == 100_000_000
+    assert 400 < max(len(k.features) for k in run) <= 440  # and the clutter

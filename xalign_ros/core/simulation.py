@@ -54,44 +54,48 @@ def camera_at(x: float, y: float, z: float, yaw: float) -> SE3:
     return SE3(np.column_stack([-left, -up, forward]), np.array([x, y, z]))
 
 
-def world(name: str, seed: int, keyframes: int) -> World:
-    """One of WORLDS; the run has so many keyframes, the map as many as its way takes. Raises ValueError on other names."""
+def world(name: str, seed: int, keyframes: int, density: float = 1.0) -> World:
+    """One of WORLDS; the run has so many keyframes, the map as many as its way takes, the walls `density` times their usual
+    landmarks. Raises ValueError on other names.
+    """
     if name not in WORLDS:
         raise ValueError(f"world '{name}' is not one of {', '.join(WORLDS)}")
-    return WORLDS[name](np.random.default_rng([1, seed]), keyframes)
+    return WORLDS[name](np.random.default_rng([1, seed]), keyframes, density)
 
 
-def _corridor(rng: np.random.Generator, keyframes: int) -> World:
+def _corridor(rng: np.random.Generator, keyframes: int, density: float) -> World:
     """A loop of corridors, 24 m x 16 m and 2.4 m wide, walked round as often as it takes."""
     inner = np.array([[0, 0], [24, 0], [24, 16], [0, 16]], float)
     outer = np.array([[-2.4, -2.4], [26.4, -2.4], [26.4, 18.4], [-2.4, 18.4]])
     walls = np.vstack([_closed(inner), _closed(outer)])
     sides = np.r_[-np.ones(4), np.ones(4)]  # the corridor lies right of the inner walls, left of the outer ones
     way = np.array([[-1.2, -1.2], [25.2, -1.2], [25.2, 17.2], [-1.2, 17.2], [-1.2, -1.2]])
-    return _built(rng, walls, sides, way, keyframes, per_m2=5.0, height=2.6)
+    return _built(rng, walls, sides, way, keyframes, per_m2=5.0 * density, height=2.6)
 
 
-def _hall(rng: np.random.Generator, keyframes: int) -> World:
+def _hall(rng: np.random.Generator, keyframes: int, density: float) -> World:
     """A hall of 30 m x 30 m with a square way round in it."""
     walls = _closed(np.array([[-15, -15], [15, -15], [15, 15], [-15, 15]], float))
     way = np.array([[-9, -9], [9, -9], [9, 9], [-9, 9], [-9, -9]], float)
-    return _built(rng, walls, np.ones(4), way, keyframes, per_m2=4.0, height=5.0)
+    return _built(rng, walls, np.ones(4), way, keyframes, per_m2=4.0 * density, height=5.0)
 
 
-def _street(rng: np.random.Generator, keyframes: int) -> World:
+def _street(rng: np.random.Generator, keyframes: int, density: float) -> World:
     """A street of 160 m between fronts, up and down again."""
     walls = np.array([[-20, 7, 180, 7], [-20, -7, 180, -7], [180, -7, 180, 7], [-20, -7, -20, 7]], float)
     way = np.array([[0, -1.5], [160, -1.5], [160, 1.5], [0, 1.5], [0, -1.5]])
-    return _built(rng, walls, np.array([-1.0, 1.0, 1.0, -1.0]), way, keyframes, per_m2=0.8, height=8.0, mapped_m=1.0)
+    return _built(
+        rng, walls, np.array([-1.0, 1.0, 1.0, -1.0]), way, keyframes, per_m2=0.8 * density, height=8.0, mapped_m=1.0
+    )
 
 
-def _lookalike(rng: np.random.Generator, keyframes: int) -> World:
+def _lookalike(rng: np.random.Generator, keyframes: int, density: float) -> World:
     """Five rooms in a row, of which the second and the fourth are the same to the last detail."""
     walls, parts = [], []
     for n in range(5):
         x = 9.0 * n
         walls.append([[x, 3, x + 9, 3], [x, -3, x + 9, -3]])
-        parts.append(_landmarks(rng, np.array(walls[-1], float), np.array([-1.0, 1.0]), 9.0, 3.0))
+        parts.append(_landmarks(rng, np.array(walls[-1], float), np.array([-1.0, 1.0]), 9.0 * density, 3.0))
     moved = np.array([18.0, 0, 0])
     parts[3] = (parts[1][0] + moved, parts[1][1], parts[1][2])
     points, normals, latent = (np.concatenate([part[k] for part in parts]) for k in range(3))
@@ -166,8 +170,10 @@ def _walked(way: Array, s: np.ndarray, shift: float, aside: float) -> tuple[SE3,
     )
 
 
-def sighted(world: World, T_map_cam: SE3, rng: np.random.Generator, track: int) -> Features:
-    """What a camera there sees: landmarks that face it with nothing between, and clutter; track ids begin at `track`."""
+def sighted(world: World, T_map_cam: SE3, rng: np.random.Generator, track: int, features: int = FEATURES) -> Features:
+    """What a camera there sees: `features` landmarks at most, that face it with nothing between, and clutter; track ids begin
+    at `track`.
+    """
     x_cam = T_map_cam.inverse().apply(world.points)
     uv, valid = CAMERA.project(x_cam)
     rows = np.flatnonzero(valid & (x_cam[:, 2] > NEAR_M) & (x_cam[:, 2] < FAR_M) & CAMERA.inside(uv))
@@ -175,7 +181,7 @@ def sighted(world: World, T_map_cam: SE3, rng: np.random.Generator, track: int) 
     facing = (to_camera * world.normals[rows]).sum(axis=1) > 0.15 * np.linalg.norm(to_camera, axis=1)
     rows = rows[facing & (rng.random(len(rows)) < DETECTED)]
     rows = rows[~_hidden(T_map_cam.t[:2], world.points[rows, :2], world.walls)]
-    rows = np.sort(rng.permutation(rows)[:FEATURES])
+    rows = np.sort(rng.permutation(rows)[:features])
     px = np.clip(uv[rows] + SIGMA_PX * rng.normal(size=(len(rows), 2)), 0, [CAMERA.width - 1, CAMERA.height - 1])
     loose = rng.uniform(0, [CAMERA.width - 1, CAMERA.height - 1], (CLUTTER, 2))
     latent = np.vstack([world.latent[rows], rng.normal(size=(CLUTTER, LATENT))])
@@ -208,30 +214,33 @@ def _hidden(eye: Array, points: Array, walls: Array) -> np.ndarray:
     return np.asarray(((along > 0) & (along < 1) & (across > 0) & (across < 1)).any(axis=1))
 
 
-def mapping(world: World, seed: int) -> list[Keyframe]:
-    """The map's keyframes; their odometry is the truth."""
+def mapping(world: World, seed: int, features: int = FEATURES) -> list[Keyframe]:
+    """The map's keyframes, with so many landmarks at most; their odometry is the truth."""
+    sights = (sighted(world, T, np.random.default_rng([2, seed, n]), 0, features) for n, T in enumerate(world.mapped))
     return [
-        Keyframe(
-            START_NS + n * PERIOD_NS, 0, n, T, CAMERA, sighted(world, T, np.random.default_rng([2, seed, n]), 0), True
-        )
-        for n, T in enumerate(world.mapped)
+        Keyframe(START_NS + n * PERIOD_NS, 0, n, T, CAMERA, seen, True)
+        for n, (T, seen) in enumerate(zip(world.mapped, sights, strict=True))
     ]
 
 
-def driving(world: World, seed: int, noise: Odometry, *, metric: bool) -> list[Keyframe]:
-    """The run's keyframes on an odometry of its own frame, unit and drift (`drifting`)."""
+def driving(
+    world: World, seed: int, noise: Odometry, *, metric: bool, features: int = FEATURES, period_ns: int = PERIOD_NS
+) -> list[Keyframe]:
+    """The run's keyframes, `period_ns` apart with so many landmarks at most, on an odometry of its own frame, unit and drift
+    (`drifting`).
+    """
     rng = np.random.default_rng([3, seed])
     S = Sim3(so3_exp(rng.normal(size=3)), 20 * rng.normal(size=3), float(np.exp(rng.uniform(-1.2, 1.1))))
     T_odom_cam, _ = drifting(world.driven, rng, noise, Sim3(S.R, S.t, 1.0) if metric else S, metric)
     many = len(world.points)
     return [
         Keyframe(
-            START_NS + n * PERIOD_NS,
+            START_NS + n * period_ns,
             1,
             n,
             T,
             CAMERA,
-            sighted(world, true, np.random.default_rng([4, seed, n]), many),
+            sighted(world, true, np.random.default_rng([4, seed, n]), many, features),
             metric,
         )
         for n, (true, T) in enumerate(zip(world.driven, T_odom_cam, strict=True))
