@@ -169,6 +169,8 @@ class OdometryCorrector:
         if m is None or m.answer is not answer or not state.localized:
             return state
         now, reason, since_s, since_m = self._judged(answer, m.carrier, m.stamp_ns, m.T_odom_child, m.cov)
+        if now is State.LOCALIZED and state.state is not State.LOCALIZED:
+            now, reason = state.state, state.reason
         likely = score(m.cov, self._config.status.score_error_m)
         return replace(state, state=now, reason=reason, score=likely, since_anchor_s=since_s, since_anchor_m=since_m)
 

@@ -27,6 +27,9 @@ from xalign_ros.core.window import Window
 LOCK_UPDATES = 3  # smoother updates until a window that starts from a consensus has settled
 PARTY_REACH = 12  # waiting anchors among which the newest looks for its like; the odometry to older ones says little
 STEPS = 10  # of the odometry that say what a step of it is like
+CHALLENGERS = 2  # anchors in a row off the prediction: one may be wrong, of two it is the odometry that is doubtful
+FOUND_NONE = 2  # keyframes in a row where nothing was found around the prediction
+OVERRULE = 6  # anchors that agree on another scale than the metre that the odometry claims
 
 WAITS = "it waits for others that agree with it"
 
@@ -80,9 +83,15 @@ class Belief:
 
     @property
     def challenged(self) -> bool:
-        """Whether an anchor off the prediction waits since the last one that was believed: it may be the odometry that broke."""
-        since = itertools.takewhile(lambda link: not link.accepted, reversed(self._links))
-        return any(link.anchor is not None for link in since)
+        """Whether it may be the odometry that broke, since the last anchor that was believed: one off the prediction waits, or
+        none was found at two keyframes before this one.
+        """
+        since = self._since_anchor
+        return len(since) > FOUND_NONE or any(link.anchor is not None for link in since)
+
+    @property
+    def _since_anchor(self) -> list[_Link]:
+        return list(itertools.takewhile(lambda link: not link.accepted, reversed(self._links)))
 
     def __len__(self) -> int:
         """Keyframes in the window."""
@@ -157,7 +166,15 @@ class Belief:
         return seconds, (newest.path - self._anchored.path) * self.scale
 
     def judged(self, cov_cam: Array) -> tuple[State, str]:
-        return judge(cov_cam, *self.since_anchor, self.config.status)
+        state, reason = judge(cov_cam, *self.since_anchor, self.config.status)
+        since = self._since_anchor
+        against = sum(link.anchor is not None for link in since)
+        if state is State.LOCALIZED and (against >= CHALLENGERS or (against and len(since) > FOUND_NONE)):
+            return (
+                State.COASTING,
+                f"anchors at {against} of {len(since)} keyframes contradict the odometry, none agrees",
+            )
+        return state, reason
 
     # -- parts of a judgement, in order --------------------------------------------------------------------------
 
@@ -187,7 +204,11 @@ class Belief:
     def _challenge(self, found: Rejection) -> tuple[Anchor | Rejection, tuple[Anchor, ...]]:
         """Find the newest waiting anchor's party, and let it take over if it may; the newest keyframe may have none."""
         waiting = [link for link in self._links if link.anchor is not None and not link.accepted][-PARTY_REACH:]
-        consensus = find_consensus(_witnesses(waiting), waiting[-1].keyframe.metric_scale, self.config)
+        metric = waiting[-1].keyframe.metric_scale
+        consensus = find_consensus(_witnesses(waiting), metric, self.config)
+        if consensus is None and metric and len(waiting) >= OVERRULE:
+            free = find_consensus(_witnesses(waiting), False, self.config)
+            consensus = free if free is not None and len(free.members) >= OVERRULE else None
         if consensus is None:
             return found, ()
         agreeing = [waiting[n] for n in consensus.members]
@@ -226,7 +247,8 @@ class Belief:
         links = list(self._links)
         links = links[[id(link) for link in links].index(id(members[0])) :]
         S, first = consensus.S_map_odom, links[0].keyframe
-        window = Window(S @ first.T_odom_cam, first.id, first.metric_scale, self.config)
+        metric = first.metric_scale and S.s == 1.0  # else it was overruled
+        window = Window(S @ first.T_odom_cam, first.id, metric, self.config)
         for n, link in enumerate(links):
             if n and link.edge is not None:
                 anew = edge_between(links[n - 1].keyframe, link.keyframe, S.s, self.config.odometry)
