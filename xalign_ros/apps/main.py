@@ -18,6 +18,7 @@ COMMANDS = {
     "replay": "align a log to a map, without ROS or (--live) through the running node",
     "batch": "smooth whole logs: every keyframe's pose from all the evidence",
     "eval": "how far a trajectory or a run's output is from the truth",
+    "align": "bring a reconstruction into the frame and scale of another one",
     "bundle": "adjust poses and points of a COLMAP model or pyTheia's file",
     "simulate": "a seeded world as map, log and truth",
     "solve": "solve a pose graph in a g2o file",

@@ -31,11 +31,11 @@ from xalign_ros.io.camera_file import read_camera
 from xalign_ros.io.colmap_reconstruction import model_cameras, read_colmap_reconstruction
 from xalign_ros.io.georeference import read_georeference
 from xalign_ros.io.hloc import read_hloc_reconstruction
-from xalign_ros.io.images import extractor, image_features, image_names
+from xalign_ros.io.images import extractor, image_features, image_names, image_stamp_ns
 from xalign_ros.io.log import Log
 from xalign_ros.io.progress_bar import progress_bar
 from xalign_ros.io.pytheia_binary import read_pytheia
-from xalign_ros.io.tum import pose_at, read_tum, seconds_to_ns
+from xalign_ros.io.tum import pose_at, read_tum
 
 
 class Placed(NamedTuple):
@@ -219,12 +219,3 @@ def _fitted(
     said = f"placed by {len(pairs)} images: scale {S.s:.6g}, sigma {sigma_m:.3g} m, largest gap {gap_m.max():.3g} m"
     print(said + (f", {far} of them left out" if far else ""), file=sys.stderr)
     return S
-
-
-def image_stamp_ns(name: str) -> int:
-    """The stamp in an image's name: decimal seconds ("1341847980.722988.png") or integer nanoseconds."""
-    stem = Path(name).stem
-    try:
-        return seconds_to_ns(stem) if "." in stem else int(stem)
-    except ValueError:
-        raise MapError(f"image {name}: it must be named by its stamp, in seconds or nanoseconds") from None

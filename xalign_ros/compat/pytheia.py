@@ -6,12 +6,12 @@ does.
 
 from types import SimpleNamespace
 
-from xalign_ros.compat import pytheia_pose_graph, pytheia_reconstruction, pytheia_structs
+from xalign_ros.compat import pytheia_pose_graph, pytheia_priors, pytheia_reconstruction, pytheia_structs
 
 sfm = SimpleNamespace(
     **{
         name: getattr(module, name)
-        for module in (pytheia_pose_graph, pytheia_reconstruction, pytheia_structs)
+        for module in (pytheia_pose_graph, pytheia_priors, pytheia_reconstruction, pytheia_structs)
         for name in module.__all__
     }
 )

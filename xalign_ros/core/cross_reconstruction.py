@@ -10,7 +10,7 @@ from xalign_ros.core.config import Odometry
 from xalign_ros.core.graph import Solution, solve
 from xalign_ros.core.lie import project_rotation
 from xalign_ros.core.odometry import edge_variance
-from xalign_ros.core.pose_graph import Anchors, OdometryEdges, PoseGraph
+from xalign_ros.core.pose_graph import Anchors, Loss, OdometryEdges, PoseGraph
 from xalign_ros.core.reconstruction import Reconstruction
 from xalign_ros.core.transforms import Sim3
 from xalign_ros.core.warp import apply
@@ -25,16 +25,19 @@ def align_to_map(
     anchors: Anchors,
     odometry: Odometry | None = None,
     *,
+    edge_loss: Loss | None = None,
     marginals: bool = False,
 ) -> tuple[Reconstruction, Solution]:
     """The run in the map's frame, metres, and the solution S_map_k (K) of its keyframes, in the order given.
 
     `keyframes` (K,): rows of the run's views, along the trajectory; `anchors` name places among them and hold T_map_cam
     with its information (a zero last row leaves scale free). Between consecutive keyframes the run's own poses are
-    scale-free odometry with the noise of `odometry`. Other views and all tracks follow (`warp.apply`), those that no
-    keyframe carries by the one similarity that the solver starts from. The priors, which were of the old frame, go.
-    Without anchors the run stays where it is and Solution.gauge says so. Raises ValueError on a keyframe that is not
-    estimated or is named twice, and on anchors at keyframes that are not there.
+    scale-free odometry with the noise of `odometry` under `edge_loss` (none by default). Other views and all tracks
+    follow (`warp.apply`), those that no keyframe carries by the one similarity that the solver starts from. The priors,
+    which were of the old frame, go. Without anchors the run stays where it is and Solution.gauge says so.
+
+    Raises ValueError on a keyframe that is not estimated or is named twice, and on anchors at keyframes that are not
+    there.
     """
     noise = odometry or Odometry()
     if len(np.unique(keyframes)) < len(keyframes):
@@ -54,7 +57,7 @@ def align_to_map(
     graph = PoseGraph(
         run.view_ids[keyframes],
         *start,
-        odometry=OdometryEdges(i, i + 1, Rt @ R[1:], t_i_j, sigmas),
+        odometry=OdometryEdges(i, i + 1, Rt @ R[1:], t_i_j, sigmas, loss=edge_loss or Loss()),
         anchors=anchors if len(anchors) else None,
     )
     solution = solve(graph, marginals=marginals)

@@ -195,9 +195,16 @@ def _search(links: list[_Link], solution: Solution, index: MapIndex, config: Con
         if link.anchor or sigma > min(config.status.lost_sigma_m, NARROWED * link.sigma):
             continue
         link.sigma = sigma
-        anchor = find_guided(k, index, S.rigid_pose(), cov_cam, config)
-        if isinstance(anchor, Anchor):
-            error = (anchor.T_map_cam.inverse() @ S.rigid_pose()).log()
-            if error @ np.linalg.solve(cov_cam + anchor.cov_cam, error) < config.lock.chi2:
-                link.anchor, found = anchor, found + 1
+        link.anchor = anchor_around(k, S, cov, index, config)
+        found += link.anchor is not None
     return found
+
+
+def anchor_around(keyframe: Keyframe, S: Sim3, cov: Array, index: MapIndex, config: Config) -> Anchor | None:
+    """The anchor found around a solution S_map_i with covariance (7, 7) and inside its gate."""
+    T, cov_cam = S.rigid_pose(), pose_covariance(S, cov)
+    anchor = find_guided(keyframe, index, T, cov_cam, config)
+    if not isinstance(anchor, Anchor):
+        return None
+    error = (anchor.T_map_cam.inverse() @ T).log()
+    return anchor if error @ np.linalg.solve(cov_cam + anchor.cov_cam, error) < config.lock.chi2 else None

@@ -14,6 +14,7 @@ from xalign_ros.core.camera import Camera
 from xalign_ros.core.errors import ConfigError, MapError
 from xalign_ros.core.extraction import EXTRACTORS, Extract
 from xalign_ros.core.records import Features
+from xalign_ros.io.tum import seconds_to_ns
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 
@@ -75,3 +76,12 @@ def extractor(name: str) -> Extract:
     if not callable(found):
         raise ConfigError(f"features '{name}' are no function; see core/extraction.py for what it takes and returns.")
     return found
+
+
+def image_stamp_ns(name: str) -> int:
+    """The stamp in an image's name: decimal seconds ("1341847980.722988.png") or integer nanoseconds."""
+    stem = Path(name).stem
+    try:
+        return seconds_to_ns(stem) if "." in stem else int(stem)
+    except ValueError:
+        raise MapError(f"image {name}: it must be named by its stamp, in seconds or nanoseconds") from None
