@@ -176,13 +176,18 @@ def _solved(links: list[_Link], start: list[Sim3], config: Config) -> Solution:
 
 
 def _drop(links: list[_Link], solution: Solution, config: Config) -> int:
-    """Anchors outside the gate of the whole run are none; their keyframes may be looked for again."""
+    """Anchors outside the gate of the whole run are none; their keyframes may be looked for again.
+
+    Where that would be all of them, the run says nothing about any.
+    """
     anchored = [link for link in links if link.anchor]
-    chi2 = np.square(solution.residuals["anchors"]).sum(axis=1)
-    for link, far in zip(anchored, chi2 > config.lock.chi2, strict=True):
-        if far:
+    far = np.square(solution.residuals["anchors"]).sum(axis=1) > config.lock.chi2
+    if far.all():
+        return 0
+    for link, wrong in zip(anchored, far, strict=True):
+        if wrong:
             link.anchor = None
-    return int((chi2 > config.lock.chi2).sum())
+    return int(far.sum())
 
 
 def _search(links: list[_Link], solution: Solution, index: MapIndex, config: Config) -> int:
