@@ -58,9 +58,10 @@ def run(args: argparse.Namespace) -> None:
         for log, name in zip(args.logs, names, strict=True)
     ]
     rows: dict[str, Row] = {}
+    unit = "m" if map_.metric else "map units"
     for n, row in progress_bar(_rows(jobs, names, args.workers, args.scheduler), "smoothing logs", len(jobs)):
         rows[names[n]] = row
-        print(f"[{len(rows)}/{len(jobs)}] {names[n]}: {_in_words(row)}", file=sys.stderr)
+        print(f"[{len(rows)}/{len(jobs)}] {names[n]}: {_in_words(row, unit)}", file=sys.stderr)
     rows = {name: rows[name] for name in names}
     write_overview(folder, rows, map_)
     lost = [row["words"] for row in rows.values() if row["status"] == "failed"]
@@ -96,10 +97,9 @@ def _names(logs: Sequence[Path]) -> list[str]:
     return names
 
 
-def _in_words(row: Row) -> str:
+def _in_words(row: Row, unit: str) -> str:
     if row["status"] == "failed" or not row["poses"]:
         return str(row["words"])
     told = "finished before, nothing has changed since; " if row["status"] == "unchanged" else ""
-    return (
-        f"{told}{row['poses']} of {row['keyframes']} keyframes have a pose, to {row['position_sigma_m']:.3g} m (median)"
-    )
+    sigma = f"{row['position_sigma_m']:.3g} {unit}"
+    return f"{told}{row['poses']} of {row['keyframes']} keyframes have a pose, to {sigma} (median)"

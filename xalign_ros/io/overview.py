@@ -52,7 +52,7 @@ def _page(title: str, rows: Rows, paths: Mapping[str, Array], map_: ReferenceMap
     colour = {name: COLOURS[n % len(COLOURS)] for n, name in enumerate(paths)}
     body = [
         f'<h1>{escape(title)}</h1><p class="lead">{escape(lead)}</p><p class="quiet">{escape(source)}</p>',
-        _picture(paths, colour, map_),
+        _picture(paths, colour, map_, m),
         f"<h2>Logs</h2><table>{''.join(_line(name, row, colour.get(name), m) for name, row in rows.items())}</table>",
     ]
     return PAGE.format(mark="", title=escape(title), body="\n".join(body))
@@ -73,7 +73,7 @@ def _line(name: str, row: Mapping[str, Any], colour: str | None, m: str) -> str:
     return f'<tr><th scope="row">{mark}{escape(name)}<small>{what}</small></th><td>{value}</td></tr>'
 
 
-def _picture(paths: Mapping[str, Array], colour: Mapping[str, str], map_: ReferenceMap) -> str:
+def _picture(paths: Mapping[str, Array], colour: Mapping[str, str], map_: ReferenceMap, m: str) -> str:
     """The map's points and the runs' ways, in the plane in which they lie."""
     points = np.asarray(map_.points[:: max(1, len(map_.points) // MOST_POINTS)])
     all_ = np.concatenate([*paths.values(), np.zeros((0, 3))])
@@ -96,9 +96,7 @@ def _picture(paths: Mapping[str, Array], colour: Mapping[str, str], map_: Refere
         parts.append(
             f'<polyline points="{way}" stroke="{colour[name]}" stroke-width="3"><title>{escape(name)}</title></polyline>'
         )
-    words = (
-        f"Where the runs went{view}: coloured as in the table, the map's points grey, {high[0] - low[0]:.3g} across."
-    )
+    words = f"Where the runs went{view}: coloured as in the table, the map's points grey, {high[0] - low[0]:.3g} {m} across."
     return (
         f'<figure><svg viewBox="0 0 {WIDTH:.0f} {height:.0f}" fill="none" style="height:auto" role="img" '
         f'aria-label="the runs on the map">{"".join(parts)}</svg><figcaption>{escape(words)}</figcaption></figure>'
