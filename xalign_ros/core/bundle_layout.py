@@ -9,11 +9,13 @@ from itertools import pairwise
 import numpy as np
 
 from xalign_ros.core.graph_system import Scatter, system
+from xalign_ros.core.lie import Array
 
 CHUNK = 64  # tracks eliminated at once
 BLOCK = 8192  # observations at once, or a few more: their intermediate values stay in the processor's cache
 TRIANGLE = np.tril_indices(6)
-SQUARE = np.divmod(np.arange(36), 6)
+LOWER = TRIANGLE[0] * 6 + TRIANGLE[1]
+TRANSPOSED = np.arange(36).reshape(6, 6).T.ravel()
 NOBODY = np.zeros(0, np.int64)
 
 
@@ -21,16 +23,17 @@ NOBODY = np.zeros(0, np.int64)
 class Chunk:
     """Consecutive tracks that are eliminated together, with a matrix B (3 tracks, 6 n) of the n nodes that see them.
 
-    at (m,): the place in B, flat, of the first number of each observation; that of coordinate c and
-    row a is c * 6 n tracks + a n further. take: numbers of B^T B, flat, and `into` their places in the system.
+    at (m,): the place in B, flat, of the first number of each observation; that of coordinate c and row a is c * 6 n
+    tracks + a n further. Of B^T B (6, n, 6, n) the blocks of nodes row, column go to the layout's blocks `pair`.
     """
 
     tracks: slice
     rows: slice
     nodes: np.ndarray
     at: np.ndarray
-    take: np.ndarray
-    into: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    pair: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,59 +67,50 @@ class Layout:
     ) -> None:
         self.count = n = int(free_views.sum())
         self.node = np.where(free_views, np.cumsum(free_views) - 1, n)
-        seen, cuts = self.node[view], np.append(np.arange(0, len(start) - 1, CHUNK), len(start) - 1)
-        parts = [
-            _Part.of_tracks(slice(int(a), int(b)), slice(int(start[a]), int(start[b])), seen, n)
-            for a, b in pairwise(cuts)
-        ]
-        pairs = [(p.nodes[p.first], p.nodes[p.second]) for p in parts]
+        seen, cuts = self.node[view], np.append(np.arange(0, len(start) - 1, CHUNK), len(start) - 1).tolist()
+        found = [np.unique(seen[start[a] : start[b]], return_inverse=True) for a, b in pairwise(cuts)]
+        local = [np.tril_indices(int((nodes < n).sum())) for nodes, _ in found]
+        keys = [nodes[column] * n + nodes[row] for (nodes, _), (row, column) in zip(found, local, strict=True)]
+        unique, pair = np.unique(np.concatenate([NOBODY, *keys]), return_inverse=True)
+        pairs = [np.divmod(unique, max(n, 1))]
         for kind in ends:
             for a, b in pairwise(kind):
                 both = np.maximum(self.node[a], self.node[b]) < n
                 pairs.append((self.node[a][both], self.node[b][both]))
-        self.system = system(n, 6, *(np.concatenate([NOBODY, *(pair[k] for pair in pairs)]) for k in (0, 1)))
-        self.blocks = tuple(_blocks(self._chunks(parts, start), seen))
+        self.system = system(n, 6, *(np.concatenate([p[k] for p in pairs]) for k in (0, 1)))
+        self._place(*pairs[0])
+        chunks, done = [], 0
+        for a, b, (nodes, of), (row, column) in zip(cuts, cuts[1:], found, local, strict=False):
+            at = np.repeat(np.arange(b - a) * (6 * len(nodes)), np.diff(start[a : b + 1])) + of
+            rows, mine = slice(int(start[a]), int(start[b])), slice(done, done + len(row))
+            chunks.append(Chunk(slice(a, b), rows, nodes, at, row, column, pair[mine]))
+            done = mine.stop
+        self.blocks = tuple(_blocks(chunks, seen))
         self.ties = [self._tied([self.node[rows] for rows in kind]) for kind in ends]
 
-    def _chunks(self, parts: list[_Part], start: np.ndarray) -> list[Chunk]:
-        """Places are asked for of all of them at once."""
-        width = np.array([len(p.nodes) for p in parts])
-        i, j, first, second = (
-            np.concatenate([NOBODY, *a])
-            for a in (
-                [p.nodes[p.first] for p in parts],
-                [p.nodes[p.second] for p in parts],
-                [p.first for p in parts],
-                [p.second for p in parts],
-            )
-        )
-        count = np.array([len(p.first) for p in parts])
+    def _place(self, i: np.ndarray, j: np.ndarray) -> None:
+        """Of U blocks (row j, column i, i <= j, U, 36) of pairs that share tracks their places in the system."""
+        self.count_blocks = len(i)
+        self._own, self._off = np.flatnonzero(i == j), np.flatnonzero(i != j)
+        i, j, own = i[self._off], j[self._off], i[self._own]
         swapped = self.system.swapped(i, j)
-        lower = self.system.lower(np.where(swapped, j, i) * self.count + np.where(swapped, i, j))
-        row, column = np.where(swapped, first, second), np.where(swapped, second, first)
-        take_lower = _numbers(SQUARE, row, column, np.repeat(width, count))
-        own = [np.arange(p.free) for p in parts]
-        diagonal = self.system.diagonal(np.concatenate([NOBODY, *(p.nodes[: p.free] for p in parts)]))
-        local = np.concatenate([NOBODY, *own])
-        take_diagonal = _numbers(TRIANGLE, local, local, np.repeat(width, [p.free for p in parts]))
-        out, at_pair, at_own = [], 0, 0
-        for p in parts:
-            pairs, mine = slice(at_pair, at_pair + len(p.first)), slice(at_own, at_own + p.free)
-            at_pair, at_own = pairs.stop, mine.stop
-            track = np.repeat(
-                np.arange(p.tracks.stop - p.tracks.start), np.diff(start[p.tracks.start : p.tracks.stop + 1])
-            )
-            out.append(
-                Chunk(
-                    p.tracks,
-                    p.rows,
-                    p.nodes,
-                    track * (6 * len(p.nodes)) + p.of,
-                    np.concatenate([take_lower[pairs].ravel(), take_diagonal[mine].ravel()]),
-                    np.concatenate([lower[pairs].ravel(), diagonal[mine].ravel()]),
-                )
-            )
-        return out
+        off = self.system.lower(np.where(swapped, j, i) * self.count + np.where(swapped, i, j))
+        off[swapped] = off[swapped][:, TRANSPOSED]
+        self._off_at, self._own_at = off, self.system.diagonal(own)
+
+    def subtract(self, blocks: Array) -> None:
+        """Blocks (U, 36) from the system."""
+        flat = self.system.flat
+        flat[self._off_at] -= blocks[self._off]
+        flat[self._own_at] -= blocks[self._own][:, LOWER]
+
+    def of(self, flat: Array) -> Array:
+        """Blocks (U, 6, 6) of a symmetric matrix that is stored as the system is."""
+        out = np.empty((self.count_blocks, 36))
+        out[self._off] = flat[self._off_at]
+        for into in (LOWER, TRANSPOSED[LOWER]):
+            out[self._own[:, None], into] = flat[self._own_at]
+        return out.reshape(-1, 6, 6)
 
     def _tied(self, ends: Sequence[np.ndarray]) -> Ties:
         own, pairs = [], []
@@ -132,26 +126,6 @@ class Layout:
         return Ties(own, pairs)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """A chunk before there are places: observation m is of nodes[of[m]]; `free` nodes are not node N; their pairs."""
-
-    tracks: slice
-    rows: slice
-    nodes: np.ndarray
-    of: np.ndarray
-    free: int
-    first: np.ndarray
-    second: np.ndarray
-
-    @staticmethod
-    def of_tracks(tracks: slice, rows: slice, seen: np.ndarray, count: int) -> _Part:
-        nodes, of = np.unique(seen[rows], return_inverse=True)
-        free = int((nodes < count).sum())
-        second, first = np.tril_indices(free, -1)
-        return _Part(tracks, rows, nodes, of, free, first, second)
-
-
 def _blocks(chunks: list[Chunk], seen: np.ndarray) -> Iterator[Block]:
     first = 0
     for n, chunk in enumerate(chunks):
@@ -160,11 +134,3 @@ def _blocks(chunks: list[Chunk], seen: np.ndarray) -> Iterator[Block]:
             nodes, local = np.unique(seen[rows], return_inverse=True)
             yield Block(rows, nodes, local, tuple(chunks[first : n + 1]))
             first = n + 1
-
-
-def _numbers(
-    within: tuple[np.ndarray, np.ndarray], row: np.ndarray, column: np.ndarray, size: np.ndarray
-) -> np.ndarray:
-    """Places in squares of `size` nodes, all first numbers of which come before all second ones, of blocks row, column."""
-    u, v, n = within[0], within[1], size[:, None]
-    return np.asarray((u * n + row[:, None]) * (6 * n) + v * n + column[:, None])

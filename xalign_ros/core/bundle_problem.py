@@ -60,8 +60,9 @@ class Problem:
         self.root_g = root_of(r.gravity.information) if r.gravity else None
         track = np.repeat(np.arange(p), np.diff(r.offsets))
         used = r.estimated[r.observing_views] & r.track_estimated[track]
-        first = np.full(p, v)
-        np.minimum.at(first, track[used], r.observing_views[used])
+        first, seen = np.full(p, v), np.flatnonzero(np.diff(r.offsets))
+        if len(seen):
+            first[seen] = np.minimum.reduceat(np.where(used, r.observing_views, v), r.offsets[seen])
         self.order = np.argsort(first, kind="stable")
         place = np.empty(p, np.int64)
         place[self.order] = np.arange(p)

@@ -93,9 +93,12 @@ class Reduced:
         self._rhs = rhs = np.zeros((self.count + 1, 6))
         rhs[: self.count] = -self.g
         zg = np.stack(_lower(L, self.gx))
+        blocks = np.zeros((self._layout.count_blocks, 36))
         for chunk, B in self._whitened() if self.count else ():
-            s.flat[chunk.into] -= (B.T @ B).reshape(-1)[chunk.take]
-            rhs[chunk.nodes] += (zg[:, chunk.tracks].reshape(-1) @ B).reshape(6, -1).T
+            n = len(chunk.nodes)
+            blocks[chunk.pair] += (B.T @ B).reshape(6, n, 6, n)[:, chunk.row, :, chunk.column].reshape(-1, 36)
+            rhs[chunk.nodes] += (zg[:, chunk.tracks].reshape(-1) @ B).reshape(6, n).T
+        self._layout.subtract(blocks)
 
     def _whitened(self) -> Iterator[tuple[Chunk, Array]]:
         """Of each chunk its matrix of W L^T."""
@@ -147,14 +150,16 @@ class Reduced:
             s.factor()
             if (s.flat[pivots] ** 2 < FREE * before).any():
                 raise SingularError
-            blocks = np.zeros_like(s.flat)
-            views[:-1] = s.marginals(blocks)
+            inverse = np.zeros_like(s.flat)
+            views[:-1] = s.marginals(inverse)
+            blocks = self._layout.of(inverse)
             for chunk, B in self._whitened():
-                C = np.zeros((B.shape[1], B.shape[1]))
-                C.reshape(-1)[chunk.take] = blocks[chunk.into]
-                C += np.tril(C, -1).T + np.triu(C, 1).T
-                columns = B.reshape(3, -1, B.shape[1])
-                inner[chunk.tracks] = np.einsum("akn,bkn->kab", columns @ C, columns)
+                n, mine = len(chunk.nodes), blocks[chunk.pair]
+                C = np.zeros((6, n, 6, n))
+                C[:, chunk.row, :, chunk.column] = mine
+                C[:, chunk.column, :, chunk.row] = np.swapaxes(mine, 1, 2)
+                columns = B.reshape(3, -1, 6 * n)
+                inner[chunk.tracks] = np.einsum("akn,bkn->kab", columns @ C.reshape(6 * n, 6 * n), columns)
         L = np.zeros_like(inner)
         L[:, ROWS, COLUMNS] = self.L.T
         points = np.swapaxes(L, 1, 2) @ (np.eye(3) + inner) @ L

@@ -191,7 +191,7 @@ def _distort_pinhole(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, n
         return m, valid, NO_JACOBIAN
     J = np.zeros((len(x), 2, 3))
     if camera.plane is None:
-        J[:, [0, 1], [0, 1]] = 1 / z[:, None]
+        J[:, 0, 0] = J[:, 1, 1] = 1 / z
         J[:, :, 2] = -a / z[:, None]
     else:
         J[:, :, :2] = Ja / z[:, None, None]
