@@ -51,6 +51,16 @@ def test_shaken_models_come_back_to_the_truth(folder, truth, tmp_path: Path, cap
     assert main([*command, "--force"]) == 0
 
 
+def test_intrinsics_that_are_refined_come_back(truth, tmp_path: Path, capsys) -> None:
+    off = Camera("radtan", CAMERA.K * [1.02, 1.02, 1, 1], CAMERA.D, 640, 480)
+    write_reconstruction(replace(truth, cameras=(off,)), tmp_path / "m", folder=True)
+    words = ["--hold-points", "--refine", "focal_length", "--refine", "principal_point", "--robust", "none"]
+    assert main(["bundle", str(tmp_path / "m"), "-o", str(tmp_path / "o"), *words]) == 0
+    found = read_reconstruction(tmp_path / "o").cameras[0]
+    np.testing.assert_allclose(found.K, CAMERA.K, atol=1e-3)
+    np.testing.assert_array_equal(found.D, CAMERA.D)
+
+
 def test_points_that_stay_hold_the_frame(truth, tmp_path: Path, capsys) -> None:
     write_reconstruction(replace(shaken(truth), points=truth.points), tmp_path / "m", folder=True)
     assert main(["bundle", str(tmp_path / "m"), "-o", str(tmp_path / "o"), "--hold-points"]) == 0

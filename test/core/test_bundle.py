@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from xalign_ros.core.bundle import DOWN, adjust
 from xalign_ros.core.bundle_factors import PoseEdges, edges_at, gravity_at, priors_at
+from xalign_ros.core.bundle_intrinsics import REFINED
 from xalign_ros.core.bundle_problem import Problem
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.lie import so3_exp
@@ -166,9 +167,9 @@ def test_a_point_that_lost_its_projections_is_put_where_its_rays_meet() -> None:
     truth = world(5)
     problem = Problem(truth, (), None, None, None, None, DOWN, True)
     behind = truth.points[problem.order] * np.where(np.arange(60) < 3, -1, 1)[:, None]
-    lost = problem.at(truth.R, truth.t, behind).reprojections.lost
+    lost = problem.at(truth.R, truth.t, behind, truth.cameras).reprojections.lost
     assert set(problem.observations.track[lost]) == {0, 1, 2}
-    placed = problem.observations.placed(truth.R, truth.t, behind, lost, np.arange(60) != 2)
+    placed = problem.observations.placed(truth.R, truth.t, behind, truth.cameras, lost, np.arange(60) != 2)
     expected = truth.points[problem.order]
     expected[2] = behind[2]  # a constant track stays
     np.testing.assert_allclose(placed, expected, atol=1e-7)
@@ -193,6 +194,43 @@ def test_an_edge_alone_carries_a_view_that_sees_nothing() -> None:
     held = np.arange(8) < 2
     done = adjust(shaken(blind, 3, keep=held), constant_views=held, edges=[edge])
     np.testing.assert_allclose(done.reconstruction.t, truth.t, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", range(len(CAMERAS)))
+def test_intrinsics_come_back_to_the_truth(kind) -> None:
+    """Shared by all views, with all that the model has; constant views and tracks hold the frame."""
+    rng = np.random.default_rng(kind)
+    truth, camera = world(kind, views=10, points=80), CAMERAS[kind]
+    track = np.repeat(np.arange(80), 10)
+    x = np.einsum("mji,mj->mi", truth.R[truth.observing_views], truth.points[track] - truth.t[truth.observing_views])
+    truth = replace(truth, camera=np.zeros(10, int), cameras=(camera,), uv=camera.project(x)[0])
+    held = np.arange(10) < 2
+    K, D = camera.K + rng.normal(0, 5, 4), camera.D * 0.9
+    start = replace(shaken(truth, kind, 0.01, held), cameras=(Camera(camera.model, K, D, 640, 480),))
+    start = replace(start, points=np.where((np.arange(80) % 4 == 0)[:, None], truth.points, start.points))
+    done = adjust(start, constant_views=held, refined=REFINED, constant_tracks=np.arange(80) % 4 == 0)
+    found = done.reconstruction.cameras[0]
+    assert done.converged and done.cost < 1e-9
+    np.testing.assert_allclose(found.K, camera.K, atol=1e-3)
+    np.testing.assert_allclose(found.D, camera.D, atol=1e-4)
+
+
+def test_intrinsics_of_several_cameras_are_refined_apart_and_as_asked() -> None:
+    truth = world(2, views=12, points=80)
+    held, fixed = np.arange(12) < 2, np.arange(80) % 4 == 0
+    off = tuple(replace_K(c, c.K * [1.02, 1.02, 1, 1]) for c in CAMERAS)
+    start = replace(shaken(truth, 2, 0.01, held), cameras=off)
+    start = replace(start, points=np.where(fixed[:, None], truth.points, start.points))
+    done = adjust(start, constant_views=held, constant_tracks=fixed, refined=["focal_length"])
+    for found, expected in zip(done.reconstruction.cameras, CAMERAS, strict=True):
+        np.testing.assert_allclose(found.K, expected.K, atol=1e-4)
+        assert (found.D == expected.D).all()
+    with pytest.raises(ValueError, match="intrinsics have no 'focus'"):
+        adjust(start, refined=["focus"])
+
+
+def replace_K(camera: Camera, K) -> Camera:
+    return Camera(camera.model, K, camera.D, camera.width, camera.height)
 
 
 def test_what_is_refused() -> None:

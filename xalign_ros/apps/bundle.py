@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from xalign_ros.core.bundle import adjust
+from xalign_ros.core.bundle_intrinsics import REFINED
 from xalign_ros.core.errors import MapError
 from xalign_ros.core.pose_graph import LOSSES, Loss
 from xalign_ros.core.reconstruction import Reconstruction
@@ -36,6 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--hold", action="append", default=[], metavar="VIEW", help="name of a view that stays; may be repeated"
     )
     parser.add_argument("--hold-points", action="store_true", help="points stay, only poses move")
+    parser.add_argument(
+        "--refine",
+        action="append",
+        default=[],
+        choices=REFINED,
+        help="of the intrinsics, which views of one camera share; may be repeated",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of words")
 
 
@@ -53,6 +61,7 @@ def run(args: argparse.Namespace) -> None:
             constant_views=held,
             constant_tracks=np.full(len(r.track_ids), args.hold_points),
             loss=args.robust,
+            refined=args.refine,
         )
     except ValueError as error:
         raise MapError(f"{args.model}: {error}") from error

@@ -1,12 +1,12 @@
 """Bundle adjustment: poses and points that make reprojections, edges between views, and priors agree best.
 
 Levenberg-Marquardt on the Schur complement (Triggs et al., "Bundle adjustment - a modern synthesis", 2000) with exact
-Jacobians; every camera model that xalign has, intrinsics constant. docs/bundle.md has the mathematics.
+Jacobians; every camera model that xalign has. docs/bundle.md has the mathematics.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,16 +52,19 @@ def adjust(
     prior_loss: Loss | None = None,
     down_world: Sequence[float] = DOWN,
     gravity_as_cross: bool = True,
+    refined: Collection[str] = (),
     max_iterations: int = 100,
 ) -> Bundled:
     """Adjusts estimated views and tracks, but for the constant ones (masks (V,), (P,)); priors are those of the record.
 
     `loss` is on the whitened length of each reprojection, each block of edges has its own, `prior_loss` is on those of
-    poses and gravity. Views that are not estimated take no part. Raises ValueError on an estimated view with
-    observations but no camera, on edges and priors of views that are not estimated, and where nothing is to be adjusted.
+    poses and gravity. `refined` names what is adjusted of the intrinsics, too, which all views of a camera share:
+    focal_length, aspect_ratio, principal_point, distortion. Views that are not estimated take no part. Raises ValueError
+    on an estimated view with observations but no camera, on edges and priors of views that are not estimated, on other
+    names, and where nothing is to be adjusted.
     """
     problem = Problem(
-        reconstruction, edges, constant_views, constant_tracks, loss, prior_loss, down_world, gravity_as_cross
+        reconstruction, edges, constant_views, constant_tracks, loss, prior_loss, down_world, gravity_as_cross, refined
     )
     at, gains = problem.start, [np.inf]
     damping, iterations, converged = FIRST_DAMPING, 0, False
@@ -82,7 +85,7 @@ def adjust(
             at, damping = there, max(damping / 10, LEAST_DAMPING)
     points = np.empty_like(at.X)
     points[problem.order] = at.X
-    adjusted = replace(reconstruction, R=project_rotation(at.R), t=at.t, points=points)
+    adjusted = replace(reconstruction, R=project_rotation(at.R), t=at.t, points=points, cameras=at.cameras)
     m, skipped = len(problem.observations), problem.skipped + int(at.reprojections.lost.sum())
     return Bundled(adjusted, problem.start.cost, at.cost, iterations, converged, m, skipped)
 
@@ -110,6 +113,7 @@ def covariances(
     gravity_as_cross: bool = True,
 ) -> Covariances:
     """Of an adjusted reconstruction, from what adjust() was given: blocks of the inverse of the whole normal matrix.
+    Intrinsics count as known.
 
     They are as true as sigma_px and the other weights. Raises ValueError where nothing holds the frame, and as adjust.
     """

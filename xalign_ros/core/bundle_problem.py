@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from xalign_ros.core.bundle_factors import Linear, PoseEdges, edges_at, gravity_at, priors_at, root_of
+from xalign_ros.core.bundle_intrinsics import Intrinsics
 from xalign_ros.core.bundle_observations import Linearized, Observations
 from xalign_ros.core.bundle_system import Reduced
+from xalign_ros.core.camera import Camera
 from xalign_ros.core.graph_band import SingularError
 from xalign_ros.core.graph_losses import Stage, weigh
 from xalign_ros.core.lie import Array, so3_exp
@@ -19,11 +21,12 @@ from xalign_ros.core.reconstruction import Reconstruction
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Poses T_world_cam, R (V, 3, 3), t (V, 3), and points X (P, 3) in the problem's order, with all residuals there."""
+    """Poses T_world_cam, R (V, 3, 3), t (V, 3), points X (P, 3) in the problem's order, cameras, all residuals there."""
 
     R: Array
     t: Array
     X: Array
+    cameras: tuple[Camera, ...]
     reprojections: Linearized
     others: list[tuple[Linear, Stage]]
     cost: float
@@ -42,6 +45,7 @@ class Problem:
         prior_loss: Loss | None,
         down_world: Sequence[float],
         gravity_as_cross: bool,
+        refined: Collection[str] = (),
     ) -> None:
         v, p = len(r.view_ids), len(r.track_ids)
         free_views = r.estimated & ~(np.zeros(v, bool) if constant_views is None else constant_views)
@@ -74,26 +78,29 @@ class Problem:
             bad = r.observing_views[rows][camera[r.observing_views[rows]] < 0][0]
             raise ValueError(f"view {r.view_ids[bad]} has observations but no camera")
         self.free_tracks, X = free_tracks[self.order], r.points[self.order]
+        self.intrinsics = Intrinsics(r.cameras, np.unique(camera[r.observing_views[rows]]), refined)
         self.observations = self._of(r, rows, track, camera)
-        self.start = self.at(r.R, r.t, X)
+        self.start = self.at(r.R, r.t, X, r.cameras)
         lost = self.start.reprojections.lost
         self.skipped = int(lost.sum())
         if self.skipped:
             self.observations = self._of(r, rows[~lost], track, camera)
-            self.start = self.at(r.R, r.t, X)
+            self.start = self.at(r.R, r.t, X, r.cameras)
         ends = [[e.i, e.j] for e in edges] + [[x.views] for x in (r.priors, r.gravity) if x is not None]
-        self.system = Reduced(self.observations.view, self.observations.track, self.free_tracks, free_views, ends)
+        o = self.observations
+        self.system = Reduced(o.view, o.track, self.free_tracks, free_views, ends, o.column, self.intrinsics)
 
     def _of(self, r: Reconstruction, rows: np.ndarray, track: np.ndarray, camera: np.ndarray) -> Observations:
         view, sigma_px = r.observing_views[rows].astype(np.int64), None if r.sigma_px is None else r.sigma_px[rows]
-        return Observations(view, track[rows], r.uv[rows], sigma_px, camera[view], r.cameras, self.loss)
+        size_px = np.array([(c.width, c.height) for c in r.cameras], float).reshape(-1, 2)
+        return Observations(view, track[rows], r.uv[rows], sigma_px, camera[view], self.intrinsics, size_px, self.loss)
 
-    def at(self, R: Array, t: Array, X: Array) -> State:
+    def at(self, R: Array, t: Array, X: Array, cameras: tuple[Camera, ...]) -> State:
         """The residuals of a state; its cost is infinite where it is not a number."""
-        reprojections = self.observations.at(R, t, X)
+        reprojections = self.observations.at(R, t, X, cameras)
         others = [(linear, (loss, np.inf)) for linear, loss in self._others(R, t)]
         cost = reprojections.cost + sum(_cost(r, stage) for (r, _), stage in others)
-        return State(R, t, X, reprojections, others, cost if np.isfinite(cost) else np.inf)
+        return State(R, t, X, cameras, reprojections, others, cost if np.isfinite(cost) else np.inf)
 
     def stepped(self, at: State, damping: float) -> State | None:
         """The state after one damped step, or None where the system is singular.
@@ -103,15 +110,15 @@ class Problem:
         """
         try:
             self.system.reduce(damping)
-            views, points = self.system.step()
-        except SingularError:
+            views, points, inner = self.system.step()
+            cameras = self.intrinsics.stepped(at.cameras, inner)
+        except (SingularError, ValueError):  # the latter is of intrinsics that no camera has
             return None
-        there = self.at(so3_exp(views[:, :3]) @ at.R, at.t + views[:, 3:], at.X + points)
+        there = self.at(so3_exp(views[:, :3]) @ at.R, at.t + views[:, 3:], at.X + points, cameras)
         lost = there.reprojections.lost
         if lost.any() and np.isfinite(there.cost):
-            again = self.at(
-                there.R, there.t, self.observations.placed(there.R, there.t, there.X, lost, self.free_tracks)
-            )
+            X = self.observations.placed(there.R, there.t, there.X, cameras, lost, self.free_tracks)
+            again = self.at(there.R, there.t, X, cameras)
             return again if again.cost < there.cost else there
         return there
 

@@ -10,8 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from xalign_ros.core.bundle_border import Border
 from xalign_ros.core.bundle_factors import Linear
-from xalign_ros.core.bundle_layout import TRIANGLE, Chunk, Layout, Ties
+from xalign_ros.core.bundle_intrinsics import Intrinsics
+from xalign_ros.core.bundle_layout import TRIANGLE, Block, Chunk, Layout, Ties
 from xalign_ros.core.bundle_observations import Linearized
 from xalign_ros.core.graph_band import SingularError
 from xalign_ros.core.graph_losses import Stage, weigh
@@ -29,7 +31,7 @@ class Reduced:
     """Observations (M) sorted by track, of views `view` (M,) and tracks `track` (M,); free tracks (P,) and views (V,).
 
     Tracks should be in an order in which neighbours are seen by the same views. ends: of each kind of other factors the
-    views (K,) of each of its ends.
+    views (K,) of each of its ends. column (M,): the first intrinsic of each observation's camera.
     """
 
     def __init__(
@@ -38,17 +40,21 @@ class Reduced:
         track: np.ndarray,
         free_tracks: np.ndarray,
         free_views: np.ndarray,
-        ends: Sequence[Sequence[np.ndarray]] = (),
+        ends: Sequence[Sequence[np.ndarray]],
+        column: np.ndarray,
+        intrinsics: Intrinsics,
     ) -> None:
         self.view, self.track, self.free = view, track, free_tracks
         self._start = np.searchsorted(track, np.arange(len(free_tracks) + 1))
         self._seen = np.flatnonzero(np.diff(self._start))
         self._layout = Layout(view, self._start, free_views, ends)
         self.node, self.count = self._layout.node, self._layout.count
+        self._border = Border(column, intrinsics.width, intrinsics.count, self.count)
 
     def build(self, at: Linearized, others: Sequence[tuple[Linear, Stage]], R: Array) -> None:
         """Of observations and other factors at poses with rotations R (V, 3, 3)."""
         self._at = at
+        self._border.build(at, self._layout.blocks)
         H = np.zeros((27, self.count + 1))
         for block in self._layout.blocks:
             A, a, d = at.A[:, block.rows], at.a[:, block.rows], at.D[:, block.rows]
@@ -93,18 +99,22 @@ class Reduced:
         self._rhs = rhs = np.zeros((self.count + 1, 6))
         rhs[: self.count] = -self.g
         zg = np.stack(_lower(L, self.gx))
-        blocks = np.zeros((self._layout.count_blocks, 36))
-        for chunk, B in self._whitened() if self.count else ():
+        blocks, border = np.zeros((self._layout.count_blocks, 36)), self._border
+        border.start(damping)
+        for block, chunk, B, factors in self._whitened() if self.count or border.count else ():
             n = len(chunk.nodes)
+            if border.count:
+                border.eliminate(block, chunk, factors, B, zg[:, chunk.tracks].reshape(-1))
             blocks[chunk.pair] += (B.T @ B).reshape(6, n, 6, n)[:, chunk.row, :, chunk.column].reshape(-1, 36)
             rhs[chunk.nodes] += (zg[:, chunk.tracks].reshape(-1) @ B).reshape(6, n).T
         self._layout.subtract(blocks)
 
-    def _whitened(self) -> Iterator[tuple[Chunk, Array]]:
-        """Of each chunk its matrix of W L^T."""
+    def _whitened(self) -> Iterator[tuple[Block, Chunk, Array, Array]]:
+        """Of each chunk its block, its matrix of W L^T, and the factors L of the block's observations."""
         for block in self._layout.blocks:
             at = block.rows
-            Z = _whitened(self._at.A[:, at], self._at.D[:, at], self.L.take(self.track[at], axis=1))
+            factors = self.L.take(self.track[at], axis=1)
+            Z = _whitened(self._at.A[:, at], self._at.D[:, at], factors)
             for chunk in block.chunks:
                 n, tracks = len(chunk.nodes), chunk.tracks.stop - chunk.tracks.start
                 rows = slice(chunk.rows.start - at.start, chunk.rows.stop - at.start)
@@ -112,13 +122,19 @@ class Reduced:
                 for c, column in enumerate(Z):
                     for a, values in enumerate(column):
                         flat[(6 * c * tracks + a) * n :][chunk.at] = values[rows]
-                yield chunk, flat.reshape(3 * tracks, 6 * n)
+                yield block, chunk, flat.reshape(3 * tracks, 6 * n), factors
 
-    def step(self) -> tuple[Array, Array]:
-        """Steps of views (V, 6) and points (P, 3). Raises SingularError."""
-        views = np.zeros((self.count + 1, 6))
+    def step(self) -> tuple[Array, Array, Array]:
+        """Steps of views (V, 6), points (P, 3) and intrinsics (Q,). Raises SingularError."""
+        views, inner = np.zeros((self.count + 1, 6)), np.zeros(0)
         if self.count:
             self._layout.system.factor()
+        if self._border.count:
+            try:
+                views[:-1], inner = self._border.solve(self._layout.system.solve, self._rhs[:-1])
+            except np.linalg.LinAlgError:
+                raise SingularError from None
+        elif self.count:
             views[:-1] = self._layout.system.solve(self._rhs[:-1])
         moved = np.ascontiguousarray(views[self.node].T)
         along = np.empty((3, len(self.view)))
@@ -128,13 +144,15 @@ class Reduced:
             e = [d[1] * w[2] - d[2] * w[1] - w[3], d[2] * w[0] - d[0] * w[2] - w[4], d[0] * w[1] - d[1] * w[0] - w[5]]
             for n, row in enumerate(SYMMETRIC):
                 along[n, block.rows] = A[row[0]] * e[0] + A[row[1]] * e[1] + A[row[2]] * e[2]
+            if self._border.count:
+                along[:, block.rows] += self._border.moved(inner, block.rows)
         g = self.gx.copy()
         if len(self._seen):
             g[:, self._seen] += np.add.reduceat(along, self._start[self._seen], axis=1)
         L = self.L
         x, y, z = _lower(L, g)
         points = np.stack([L[0] * x + L[1] * y + L[3] * z, L[2] * y + L[4] * z, L[5] * z], axis=1)
-        return views[self.node], -points
+        return views[self.node], -points, inner
 
     def covariances(self) -> tuple[Array, Array]:
         """Of views (V, 6, 6) and points (P, 3, 3), after reduce(0); zeros where they are constant, NaN where unknown.
@@ -153,7 +171,7 @@ class Reduced:
             inverse = np.zeros_like(s.flat)
             views[:-1] = s.marginals(inverse)
             blocks = self._layout.of(inverse)
-            for chunk, B in self._whitened():
+            for _, chunk, B, _ in self._whitened():
                 n, mine = len(chunk.nodes), blocks[chunk.pair]
                 C = np.zeros((6, n, 6, n))
                 C[:, chunk.row, :, chunk.column] = mine
