@@ -6,12 +6,28 @@ does.
 
 from types import SimpleNamespace
 
-from xalign_ros.compat import pytheia_pose_graph, pytheia_priors, pytheia_reconstruction, pytheia_structs
+from xalign_ros.compat import (
+    pytheia_bundle,
+    pytheia_bundle_options,
+    pytheia_pose_graph,
+    pytheia_priors,
+    pytheia_reconstruction,
+    pytheia_structs,
+    pytheia_views,
+)
 
 sfm = SimpleNamespace(
     **{
         name: getattr(module, name)
-        for module in (pytheia_pose_graph, pytheia_priors, pytheia_reconstruction, pytheia_structs)
+        for module in (
+            pytheia_bundle,
+            pytheia_bundle_options,
+            pytheia_pose_graph,
+            pytheia_priors,
+            pytheia_reconstruction,
+            pytheia_structs,
+            pytheia_views,
+        )
         for name in module.__all__
     }
 )

@@ -10,7 +10,6 @@ from xalign_ros.compat.pytheia_reconstruction import (
     GetSim3LieFromView,
     Reconstruction,
     SetViewCameraFromSim3Lie,
-    View,
     similarity,
     tangents,
     views_of,
@@ -22,6 +21,7 @@ from xalign_ros.compat.pytheia_structs import (
     CrossViewAnchorEdge,
     SequentialSim3Edge,
 )
+from xalign_ros.compat.pytheia_views import View
 from xalign_ros.core.graph import Solution, solve
 from xalign_ros.core.lie import Array
 from xalign_ros.core.pose_graph import (

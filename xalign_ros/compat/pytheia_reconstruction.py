@@ -1,19 +1,17 @@
-"""pyTheia's reconstruction as far as a pose graph needs it: mutable, by id, world to camera."""
+"""pyTheia's reconstruction as far as alignment needs it: mutable, by id, world to camera."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from xalign_ros.core.lie import Array, sim3_exp, sim3_log, so3_exp, so3_log
+from xalign_ros.compat.pytheia_views import Feature, View, vector
+from xalign_ros.core.lie import Array, sim3_exp, sim3_log
 from xalign_ros.core.transforms import Sim3
 
 __all__ = [
-    "Camera",
-    "Feature",
     "GetSim3LieFromView",
     "Reconstruction",
     "RelativeSim3BetweenViews",
@@ -22,7 +20,6 @@ __all__ = [
     "Sim3ToHomogeneousMatrix",
     "Sim3ToRotationTranslationScale",
     "Track",
-    "View",
     "kInvalidTrackId",
     "kInvalidViewId",
 ]
@@ -31,73 +28,17 @@ kInvalidViewId = kInvalidTrackId = 2**32 - 1  # pyTheia's names
 SOPHUS = [3, 4, 5, 0, 1, 2, 6]  # where our rotation, translation, log-scale stand in its tangent, and back
 
 
-class Camera:
-    """A camera's position (3,) in the world and its world-to-camera rotation (3, 3)."""
-
-    def __init__(self) -> None:
-        self._position, self._rotation = np.zeros(3), np.eye(3)
-
-    def GetPosition(self) -> Array:
-        return self._position.copy()
-
-    def SetPosition(self, position: ArrayLike) -> None:
-        self._position = _vector(position, 3, "a position")
-
-    def GetOrientationAsRotationMatrix(self) -> Array:
-        return self._rotation.copy()
-
-    def SetOrientationFromRotationMatrix(self, rotation: ArrayLike) -> None:
-        R = np.array(rotation, float)
-        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
-            raise ValueError("an orientation must be a rotation matrix (3, 3)")
-        self._rotation = R
-
-    def GetOrientationAsAngleAxis(self) -> Array:
-        return so3_log(self._rotation)
-
-    def SetOrientationFromAngleAxis(self, angle_axis: ArrayLike) -> None:
-        self._rotation = so3_exp(_vector(angle_axis, 3, "an angle-axis"))
-
-
-class View:
-    def __init__(self, name: str, timestamp: float = 0.0) -> None:
-        self._name, self._timestamp, self._estimated, self._camera = name, timestamp, False, Camera()
-
-    def Name(self) -> str:
-        return self._name
-
-    def GetTimestamp(self) -> float:
-        return self._timestamp
-
-    def IsEstimated(self) -> bool:
-        return self._estimated
-
-    def SetIsEstimated(self, estimated: bool) -> None:
-        self._estimated = bool(estimated)
-
-    def Camera(self) -> Camera:
-        return self._camera
-
-    MutableCamera = Camera
-
-
-class Feature:
-    """Where a view sees a track: point (2,) px."""
-
-    def __init__(self, *point: Any) -> None:  # (2,), or x and y
-        self.point = _vector(point[0] if len(point) == 1 else point, 2, "a feature") if point else np.zeros(2)
-
-
 class Track:
     def __init__(self) -> None:
         self._point, self._estimated, self._views = np.zeros(4), False, set[int]()
+        self.features: dict[int, Feature] = {}  # by view, the reference view first
 
     def Point(self) -> Array:
         """Homogeneous (4,); zeros until it is set."""
         return self._point.copy()
 
     def SetPoint(self, point: ArrayLike) -> None:
-        self._point = _vector(point, 4, "a point (homogeneous)")
+        self._point = vector(point, 4, "a point (homogeneous)")
 
     def IsEstimated(self) -> bool:
         return self._estimated
@@ -120,12 +61,14 @@ class Reconstruction:
 
     def __init__(self) -> None:
         self._views: dict[int, View] = {}
+        self._groups: dict[int, int] = {}
         self._tracks: dict[int, Track] = {}
 
     def AddView(self, name: str, *group_and_timestamp: float) -> int:
         """AddView(name, timestamp) or (name, intrinsics group, timestamp): the new view's id.
 
-        kInvalidViewId where the name or the timestamp is taken. The group is not of a pose graph and is not kept.
+        kInvalidViewId where the name or the timestamp is taken. Views of a group share intrinsics; without one a view has
+        its own.
         """
         if len(group_and_timestamp) not in (1, 2):
             raise TypeError("AddView takes a name, perhaps an intrinsics group, and a timestamp")
@@ -133,7 +76,13 @@ class Reconstruction:
         if any(name == v.Name() or timestamp == v.GetTimestamp() for v in self._views.values()):
             return kInvalidViewId
         self._views[len(self._views)] = View(name, timestamp)
-        return len(self._views) - 1
+        view_id = len(self._views) - 1
+        own = max(self._groups.values(), default=-1) + 1
+        self._groups[view_id] = int(group_and_timestamp[0]) if len(group_and_timestamp) == 2 else own
+        return view_id
+
+    def CameraIntrinsicsGroupIdFromViewId(self, view_id: int) -> int:
+        return self._groups.get(view_id, kInvalidViewId)
 
     def View(self, view_id: int) -> View | None:
         return self._views.get(view_id)
@@ -154,10 +103,12 @@ class Reconstruction:
         return len(self._tracks) - 1
 
     def AddObservation(self, view_id: int, track_id: int, feature: Feature | None = None) -> bool:
-        """False for an unknown view or track and where the view has the track; the feature is not kept."""
+        """False for an unknown view or track and where the view has the track. Only with a feature is it for reprojection."""
         if view_id not in self._views or track_id not in self._tracks or view_id in self._tracks[track_id].ViewIds():
             return False
         self._tracks[track_id].AddView(view_id)
+        if feature is not None:
+            self._tracks[track_id].features[view_id] = feature
         return True
 
     def Track(self, track_id: int) -> Track | None:
@@ -170,6 +121,9 @@ class Reconstruction:
 
     def NumTracks(self) -> int:
         return len(self._tracks)
+
+    def InitializeInverseDepth(self) -> None:
+        """Nothing to do: bundle adjustment is over points."""
 
 
 def Sim3FromRotationTranslationScale(R: ArrayLike, t: ArrayLike, scale: float) -> Array:
@@ -217,7 +171,7 @@ def _of_view(view: View | None) -> Sim3:
 
 def similarity(lie: ArrayLike, what: str) -> Sim3:
     """Of Sophus' tangent (7,). Raises ValueError on other shapes and on numbers that are not finite."""
-    x = _vector(lie, 7, what)
+    x = vector(lie, 7, what)
     R, t, s = sim3_exp(x[SOPHUS])
     return Sim3(R, t, float(s))
 
@@ -238,12 +192,3 @@ def views_of(reconstruction: Reconstruction, ids: list[int], role: str) -> Mappi
             raise ValueError(f"{role} view {view_id} is named twice")
         views[int(view_id)] = view
     return views
-
-
-def _vector(value: ArrayLike, size: int, what: str) -> Array:
-    x = np.array(value, float).reshape(-1) if np.size(value) == size else np.zeros(0)
-    if len(x) != size:
-        raise ValueError(f"{what} has {size} numbers, not {np.size(value)}")
-    if not np.isfinite(x).all():
-        raise ValueError(f"{what} has a number that is not finite")
-    return x
