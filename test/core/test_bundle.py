@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bundle_problems import CONSTANT_TRACKS, golden, of_the_table
+from bundle_problems import CONSTANT_TRACKS, chain, golden, of_the_table
 from graph_problems import GOLDEN
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -161,6 +161,18 @@ def test_points_alone_come_back_where_all_views_are_constant() -> None:
     done = adjust(start, constant_views=np.ones(8, bool))
     assert done.converged and (done.reconstruction.t == truth.t).all()
     np.testing.assert_allclose(done.reconstruction.points, truth.points, atol=1e-7)
+
+
+def test_edges_alone_are_enough() -> None:
+    truth = world(6)
+    none = np.zeros(0, int)
+    bare = replace(
+        truth, track_ids=none, points=np.zeros((0, 3)), track_estimated=np.zeros(0, bool), offsets=np.zeros(1, int),
+        observing_views=none, uv=np.zeros((0, 2)),
+    )  # fmt: skip
+    held = np.arange(8) < 1
+    done = adjust(shaken(bare, 6, keep=held), edges=[chain(truth.R, truth.t, (100, 30, 0, 0))], constant_views=held)
+    np.testing.assert_allclose(done.reconstruction.t, truth.t, atol=1e-9)
 
 
 def test_a_point_that_lost_its_projections_is_put_where_its_rays_meet() -> None:

@@ -83,7 +83,7 @@ class Observations:
         """
         m = len(self)
         A, a, D, lost, cost = np.empty((6, m)), np.empty((3, m)), np.empty((3, m)), np.empty(m, bool), 0.0
-        R, t, X = (np.ascontiguousarray(x.reshape(len(x), -1).T) for x in (R, t, X))
+        R, t, X = (np.ascontiguousarray(x.reshape(len(x), n).T) for x, n in ((R, 9), (t, 3), (X, 3)))
         q, Q_all = self.intrinsics.width, self.intrinsics.count
         N, F, f = np.empty((3, q, m if q else 0)), np.zeros((Q_all, Q_all)), np.zeros(Q_all)
         for part, by_camera in self._blocks:
