@@ -6,12 +6,14 @@ import stat
 import numpy as np
 import pytest
 from log_samples import KINDS, T0, some_keyframes, write_mcap, write_plain_mcap, write_rosbag2
-from mcap.writer import CompressionType, IndexType
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 from message_samples import a_keyframe, assert_same_keyframe
 from rosbags.rosbag2 import StoragePlugin
 
 from xalign_ros.core.errors import LogError
 from xalign_ros.io.log import Log
+from xalign_ros.io.messages import KEYFRAME
 
 LFS = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a214614ab2935c943f9e0ff69d22e\nsize 12345\n"
 
@@ -43,9 +45,11 @@ def folder_with(name, change):
 
 
 def folder_with_cut_mcap(path):
-    write_rosbag2(path, some_keyframes(2), StoragePlugin.MCAP)
+    """Twelve chunks of two keyframes each, of which the last three are gone."""
+    write_rosbag2(path, some_keyframes(24), StoragePlugin.MCAP, topic="keyframes")
     part = path / f"{path.name}.mcap"
-    part.write_bytes(part.read_bytes()[:-20])
+    write_plain_mcap(part, some_keyframes(24), chunk_size=2000)
+    part.write_bytes(part.read_bytes()[: chunks_of(part)[-3] + 50])
 
 
 def folder_without_its_file(path):
@@ -66,9 +70,19 @@ def with_summary_changed(path):
     path.write_bytes(whole)
 
 
-def foreign_profile(path):
-    whole = write_mcap(path, some_keyframes(2)).read_bytes()
-    path.write_bytes(whole.replace(b"ros2", b"ros7", 1))
+def foreign_encoding(path):
+    writer = Writer(str(path))
+    writer.start(profile="ros1")
+    schema = writer.register_schema(KEYFRAME, "ros1msg", b"uint64 id")
+    channel = writer.register_channel("keyframes", "ros1", schema)
+    writer.add_message(channel, T0, b"12345678", T0)
+    writer.finish()
+
+
+def chunks_of(path):
+    """Where each chunk of an MCAP file begins."""
+    with path.open("rb") as file:
+        return [chunk.chunk_start_offset for chunk in make_reader(file).get_summary().chunk_indexes]
 
 
 BAD = {
@@ -84,7 +98,7 @@ BAD = {
     "old.bag": (lambda path: path.write_bytes(b"#ROSBAG V1.2\n" + bytes(5000)), "is no log: neither MCAP"),
     "magic_only.mcap": (lambda path: path.write_bytes(b"\x89MCAP0\r\n"), "is cut off"),
     "summary.mcap": (with_summary_changed, "summary does not match its checksum"),
-    "profile.mcap": (foreign_profile, "Profile is not ros2"),
+    "encoding.mcap": (foreign_encoding, "holds keyframes as ros1, not as CDR"),
     "pending.db3": (database_with_pending_log, "was not closed by its recorder"),
     "no_metadata": (folder_without_metadata, "folder without metadata.yaml"),
     "empty_folder": (lambda path: path.mkdir(), "folder without metadata.yaml"),
@@ -96,7 +110,7 @@ BAD = {
     "new_metadata": (folder_with("metadata.yaml", lambda b: b.replace(b"version: 9", b"version: 99")), "99"),
     "cut_db3": (folder_with("cut_db3.db3", lambda b: b[: len(b) // 2]), "cut_db3.db3"),
     "pointer_db3": (folder_with("pointer_db3.db3", lambda b: LFS.encode()), "pointer_db3.db3 is a git-LFS pointer"),
-    "cut_mcap": (folder_with_cut_mcap, "cut_mcap.mcap is cut off"),
+    "cut_mcap": (folder_with_cut_mcap, "cut_mcap.mcap is cut off .* but metadata.yaml announces 24: copy it again"),
 }
 
 
@@ -117,7 +131,7 @@ def test_unreadable_file(tmp_path):
         read(path)
 
 
-@pytest.mark.parametrize(("kind", "step"), [("mcap", 13), ("rosbag1", 31), ("rosbag1_lz4", 31), ("db3", 151)])
+@pytest.mark.parametrize(("kind", "step"), [("rosbag1", 31), ("rosbag1_lz4", 31), ("db3", 151)])
 def test_log_cut_anywhere_is_one_sentence(kind, step, tmp_path):
     """Never a part of the messages without an error, and no error but LogError."""
     keyframes = some_keyframes(3, n=2)
@@ -128,6 +142,39 @@ def test_log_cut_anywhere_is_one_sentence(kind, step, tmp_path):
         with pytest.raises(LogError) as error:
             read(path)
         assert_one_sentence(error, path)
+
+
+@pytest.mark.parametrize("chunk_size", [0, 1, 4000])
+def test_an_mcap_file_cut_anywhere_gives_what_is_whole_and_says_so(chunk_size, tmp_path, capsys):
+    """As a recorder leaves it that crashed. Without any whole message it is an error."""
+    options = {"chunk_size": chunk_size} if chunk_size else {"use_chunking": False}
+    path, keyframes = tmp_path / "run.mcap", some_keyframes(9, n=2)
+    whole = write_plain_mcap(path, keyframes, **options).read_bytes()
+    lengths = []
+    for size in sorted({*range(0, len(whole), 97), *range(len(whole) - 60, len(whole))}):
+        path.write_bytes(whole[:size])
+        capsys.readouterr()
+        try:
+            with Log(path) as log:
+                got = [keyframe for _, keyframe, _ in log.keyframes()]
+        except LogError as error:
+            assert not lengths and ("is cut off after" in str(error) or "is empty" in str(error))
+            continue
+        for keyframe, back in zip(keyframes, got, strict=False):
+            assert_same_keyframe(keyframe, back)
+        lengths.append(len(got))
+        told = capsys.readouterr().err
+        assert told.count("\n") == 1 and f"the first {len(got)} messages" in told and f"of {size} bytes" in told
+    assert lengths == sorted(lengths) and lengths[-1] == len(keyframes) and len(set(lengths)) > 2
+
+
+def test_zeros_where_the_rest_of_an_mcap_file_should_be(tmp_path, capsys):
+    """As a file system leaves it that lost power."""
+    path, keyframes = tmp_path / "run.mcap", some_keyframes(12, n=2)
+    whole = write_plain_mcap(path, keyframes, chunk_size=2000).read_bytes()
+    path.write_bytes(whole[: chunks_of(path)[2] + 40] + bytes(5000))
+    assert read(path) == list(range(len(read(path)))) and 0 < len(read(path)) < 12
+    assert "is cut off or was not closed by its recorder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["mcap", "rosbag1", "rosbag1_lz4", "rosbag1_bz2", "db3"])
@@ -169,25 +216,15 @@ def test_corrupt_chunk_is_told_by_its_checksum(compression, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"index_types": IndexType.CHUNK}, "announces 6 messages on keyframes but delivers 0"),
-        ({"use_chunking": False}, "not in timestamp order"),
-    ],
-)
-def test_mcap_with_half_an_index_is_refused_not_half_read(options, words, tmp_path):
-    path = write_plain_mcap(tmp_path / "run.mcap", some_keyframes()[::-1], **options)
-    with pytest.raises(LogError, match=words) as error:
-        read(path)
-    assert_one_sentence(error, path)
-
-
-@pytest.mark.parametrize(
     "options",
     [
         {"chunk_size": 1},
         {"chunk_size": 3000, "compression": CompressionType.LZ4},
         {"use_statistics": False},
+        {"use_chunking": False},
+        {"use_chunking": False, "index_types": IndexType.NONE, "use_statistics": False},
+        {"index_types": IndexType.CHUNK},
+        {"index_types": IndexType.NONE},
         {"repeat_channels": False, "repeat_schemas": False},
         {"enable_crcs": False, "compression": CompressionType.NONE},
     ],
@@ -199,9 +236,3 @@ def test_mcap_as_others_write_it(options, tmp_path):
     expected = sorted(range(len(times)), key=lambda k: times[k])
     with Log(write_plain_mcap(tmp_path / "run.mcap", keyframes, **options)) as log:
         assert [keyframe.id for _, keyframe, _ in log.keyframes()] == expected
-
-
-def test_mcap_without_any_index_is_read_in_the_order_of_the_file(tmp_path):
-    path = write_plain_mcap(tmp_path / "run.mcap", some_keyframes(), use_chunking=False, index_types=IndexType.NONE)
-    with Log(path) as log:
-        assert [keyframe.id for _, keyframe, _ in log.keyframes()] == [0, 1, 2, 3, 4, 5]

@@ -5,6 +5,7 @@ right, S Exp(d), so they live in the axes and units of the second frame. Sources
 theory" (arXiv 1812.01537) for SO(3) and SE(3); Eade, "Lie groups for 2D and 3D transformations" (2013) for Sim(3).
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,17 @@ def quat_from_rotation(R: ArrayLike) -> Array:
 def rotation_from_quat(q_xyzw: ArrayLike) -> Array:
     """Rotations (..., 3, 3) of quaternions (..., 4) x y z w, normalised here; a zero quaternion gives NaN."""
     q = np.asarray(q_xyzw, float)
+    if q.ndim == 1:  # the same in Python's own numbers, in a fifth of the time
+        x, y, z, w = q.tolist()
+        norm = math.sqrt(x * x + y * y + z * z + w * w) or math.nan
+        x, y, z, w = x / norm, y / norm, z / norm, w / norm
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
     with np.errstate(invalid="ignore", divide="ignore"):
         q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     x, y, z, w = np.moveaxis(q, -1, 0)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import heapq
 import os
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from functools import cache, lru_cache
 from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
@@ -17,17 +17,17 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, ConnectionExtRosbag2, MessageDefinitionFormat
 from rosbags.rosbag2.reader import DirectoryReader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from xalign_ros.core.errors import LogError, XalignError
 from xalign_ros.core.records import Keyframe, Rejection
 from xalign_ros.io.log_files import reader_for, stored, translated, words
+from xalign_ros.io.log_types import defined, deserialized, typestore
+from xalign_ros.io.mcap_file import McapFile
 from xalign_ros.io.messages import KEYFRAME, keyframe_from_message
-from xalign_ros.io.msgdefs import message_definitions
 
-HEADER = "std_msgs/msg/Header"
-CDR_HEADER, CDR_TAIL = 4, 8  # bytes before a message, and fewer than these behind it
+__all__ = ["Log", "LogWriter", "RawMessage", "Topic", "typestore"]
+
 LISTED = 12  # topics named in an error
 FOREVER = "sec: 9223372036\n    nsec: 854775807"
 # As the recorder writes it up to metadata version 8, the form which every later version reads too.
@@ -61,20 +61,7 @@ class RawMessage(NamedTuple):
 
     def message(self) -> Any:
         """Of a type that `typestore` has; raises whatever bytes that are none make it raise."""
-        return _deserialized(typestore(), self.data, self.type)
-
-
-@cache
-def typestore() -> Typestore:
-    """The ROS 2 types and those of xalign_msgs, for logs without ROS. Shared: register nothing more in it."""
-    newest = next(name for name in ("ROS2_KILTED", "ROS2_JAZZY", "ROS2_HUMBLE") if hasattr(Stores, name))
-    store = get_typestore(Stores[newest])
-    store.register({k: v for name, text in message_definitions().items() for k, v in _parsed(text, name).items()})
-    return store
-
-
-def _parsed(text: str, name: str) -> dict[str, Any]:
-    return dict(get_types_from_msg(text, name))
+        return deserialized(typestore(), self.data, self.type)
 
 
 class Log:
@@ -85,7 +72,7 @@ class Log:
         self._stack = ExitStack()
         self._storages: list[Any] = []
         self._announced: dict[tuple[str, str], int] = {}
-        self._unpack: Callable[[bytes], bytes] = bytes
+        self._unpack: Callable[[bytes], bytes] | None = None
 
     def __enter__(self) -> Log:
         with ExitStack() as stack, translated(self.path):
@@ -110,11 +97,21 @@ class Log:
                 **_counts(c for s in self._storages for c in s.connections),
                 **_counts(reader.connections),
             }
+            self._say_unfinished()
             self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
+
+    def _say_unfinished(self) -> None:
+        """A part without an end is read as far as it goes, unless more is announced elsewhere."""
+        for part in self._storages:
+            if isinstance(part, McapFile) and part.unfinished:
+                held = sum(c.msgcount for s in self._storages for c in s.connections)
+                if held != (told := sum(self._announced.values())):
+                    raise LogError(f"{part.unfinished}, but metadata.yaml announces {told}: copy it again")
+                print(part.unfinished, file=sys.stderr)
 
     def topics(self) -> list[Topic]:
         """All topics by name, with the number of messages the log announces."""
@@ -141,7 +138,7 @@ class Log:
         """
         for connection, time_ns, data in self._read({(self.keyframe_topic(topic), KEYFRAME)}):
             with self._named(connection, time_ns):
-                message = _deserialized(self._store(connection), self._cdr(connection, data), KEYFRAME)
+                message = self._message(connection, data)
             yield time_ns, *keyframe_from_message(message)
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
@@ -151,7 +148,7 @@ class Log:
         for connection, time_ns, data in self._read(wanted):
             with self._named(connection, time_ns):
                 cdr = self._cdr(connection, data)
-            yield RawMessage(connection.topic, connection.msgtype, time_ns, cdr)
+            yield RawMessage(connection.topic, connection.msgtype, time_ns, bytes(cdr))
 
     def _read(self, wanted: set[tuple[str, str]]) -> Iterator[tuple[Connection, int, bytes]]:
         streams = []
@@ -166,24 +163,29 @@ class Log:
         with translated(self.path):
             for connection, time_ns, data in heapq.merge(*streams, key=itemgetter(1)):
                 delivered += 1
-                yield connection, time_ns, self._unpack(data)
+                yield connection, time_ns, self._unpack(data) if self._unpack else data
         announced = sum(self._announced[key] for key in wanted)
         if delivered != announced:
             names = ", ".join(sorted(name for name, _ in wanted)[:LISTED])
             told = f"announces {announced} messages on {names} but delivers {delivered}"
             raise LogError(f"{self.path} {told}: reindex it (`ros2 bag reindex`, `mcap recover`)")
 
+    def _message(self, connection: Connection, data: bytes) -> Any:
+        if isinstance(connection.ext, ConnectionExtRosbag1):
+            return self._store(connection, seq=True).deserialize_ros1(data, connection.msgtype)
+        return deserialized(self._store(connection), data, connection.msgtype)
+
     def _cdr(self, connection: Connection, data: bytes) -> bytes:
         if isinstance(connection.ext, ConnectionExtRosbag1):
             return bytes(self._store(connection).ros1_to_cdr(data, connection.msgtype))
         return data
 
-    def _store(self, connection: Connection) -> Typestore:
+    def _store(self, connection: Connection, seq: bool = False) -> Typestore:
         """The type as the log defines it, else as we do."""
         definition = connection.msgdef
         if definition.format is not MessageDefinitionFormat.MSG or not definition.data.strip():
             return typestore()
-        store, difference = _embedded(connection.msgtype, definition.data)
+        store, difference = defined(connection.msgtype, definition.data, seq)
         if difference:
             raise LogError(f"{self.path} has another {difference}")
         return store
@@ -204,39 +206,11 @@ class Log:
         return ", ".join(told[:LISTED]) + more if told else "no topics at all"
 
 
-@lru_cache(maxsize=32)
-def _embedded(kind: str, text: str) -> tuple[Typestore, str]:
-    """The store of a definition that a log carries, and in which part a Keyframe differs from ours."""
-    store, types = get_typestore(Stores.EMPTY), _parsed(text, kind)
-    if HEADER in types:
-        types[HEADER] = typestore().fielddefs[HEADER]  # that of ROS 1 has a seq, which the conversion to CDR drops
-    store.register(types)
-    for name in sorted(types) if kind == KEYFRAME else ():
-        theirs, ours = (_fields(known.fielddefs.get(name, ((), ()))[1]) for known in (store, typestore()))
-        if ours != theirs:
-            return store, f"{name} than we know: {' '.join(field for field, _ in theirs)}"
-    return store, ""
-
-
-def _fields(entries: Iterable[tuple[str, Any]]) -> list[tuple[str, Any]]:
-    return [(name.lower() if name in tuple("DKRP") else name, what) for name, what in entries]  # of ROS 1's CameraInfo
-
-
 def _counts(connections: Iterable[Connection]) -> dict[tuple[str, str], int]:
     counts: Counter[tuple[str, str]] = Counter()
     for c in connections:
         counts[c.topic, c.msgtype] += c.msgcount
     return dict(counts)
-
-
-def _deserialized(store: Typestore, data: bytes, kind: str) -> Any:
-    """The message; rclpy may leave a few undefined bytes behind it, which rosbags itself takes for damage."""
-    definition = store.get_msgdef(kind)
-    read = definition.deserialize_cdr_le if data[1] else definition.deserialize_cdr_be
-    message, end = read(memoryview(data)[CDR_HEADER:], 0, definition.cls, store)
-    if not 0 <= len(data) - CDR_HEADER - end < CDR_TAIL:
-        raise ValueError(f"{len(data)} bytes do not hold one {kind}")
-    return message
 
 
 class LogWriter:

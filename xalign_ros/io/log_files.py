@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
-import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2.reader import DirectoryReader
-from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from xalign_ros.core.errors import LogError, XalignError
+from xalign_ros.io.mcap_file import McapFile
+from xalign_ros.io.mcap_records import MAGIC as MCAP_MAGIC
 
-MCAP_MAGIC = b"\x89MCAP0\r\n"
-MCAP_FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, start of summary, start of offsets, crc of summary, magic
 SQLITE_MAGIC = b"SQLite format 3\0"
 SQLITE_HEAD = 100
 SQLITE_PAGES = struct.Struct(">16xH10xI")  # size of a page, number of pages
 READERS: dict[bytes, Any] = {
-    MCAP_MAGIC: McapReader,
+    MCAP_MAGIC: McapFile,
     SQLITE_MAGIC: Sqlite3Reader,
     b"#ROSBAG V2.0\n": Rosbag1Reader,
 }
 
 
+class Folder(DirectoryReader):
+    """A rosbag2 folder of the files that we read."""
+
+    STORAGE_PLUGINS: Mapping[str, Any] = {"mcap": McapFile, "sqlite3": Sqlite3Reader}
+
+
 def reader_for(path: Path) -> Any:
-    """The rosbags reader, not yet open, for what `path` holds. Raises LogError for what can be told at a glance."""
+    """The reader, not yet open, for what `path` holds. Raises LogError for what can be told at a glance."""
     if not path.exists():
         raise LogError(f"there is no log {path}")
     if path.is_dir():
@@ -39,7 +42,7 @@ def reader_for(path: Path) -> Any:
             raise LogError(
                 f"{path} is a folder without metadata.yaml: name a file in it or run `ros2 bag reindex` on it"
             )
-        return DirectoryReader(path)
+        return Folder(path)
     with path.open("rb") as file:
         head = file.read(64)
     if not head:
@@ -55,21 +58,14 @@ def reader_for(path: Path) -> Any:
 
 def _check_whole(path: Path, magic: bytes) -> None:
     size = path.stat().st_size
-    with path.open("rb") as file:
-        if size < (SQLITE_HEAD if magic == SQLITE_MAGIC else len(magic) + MCAP_FOOTER.size):
+    if magic == SQLITE_MAGIC:
+        with path.open("rb") as file:
+            head = file.read(SQLITE_HEAD)
+        if size < SQLITE_HEAD:
             raise LogError(f"{path} is cut off after {size} bytes: copy it again")
-        if magic == MCAP_MAGIC:
-            file.seek(-MCAP_FOOTER.size, os.SEEK_END)
-            opcode, length, summary, _, crc, end = MCAP_FOOTER.unpack(file.read())
-            if (opcode, length, end) != (2, 20, MCAP_MAGIC):
-                raise LogError(f"{path} is cut off: the MCAP footer is missing; `mcap recover` saves what there is")
-            file.seek(min(summary or size - MCAP_FOOTER.size, size))
-            if crc and crc32(file.read()[:-12]) != crc:
-                raise LogError(f"{path} is damaged: its summary does not match its checksum; try `mcap recover`")
-        if magic == SQLITE_MAGIC:
-            page, pages = SQLITE_PAGES.unpack_from(head := file.read(SQLITE_HEAD))
-            if head[24:28] == head[92:96] and size < (65536 if page == 1 else page) * pages:
-                raise LogError(f"{path} is cut off after {size} bytes: copy it again")
+        page, pages = SQLITE_PAGES.unpack_from(head)
+        if head[24:28] == head[92:96] and size < (65536 if page == 1 else page) * pages:
+            raise LogError(f"{path} is cut off after {size} bytes: copy it again")
     wal = path.with_name(f"{path.name}-wal")
     if magic == SQLITE_MAGIC and wal.exists() and wal.stat().st_size:
         merge = f"sqlite3 {path} 'PRAGMA wal_checkpoint(TRUNCATE)'"

@@ -6,6 +6,7 @@ How messages are met and built, and how a ROS covariance relates to ours, is tol
 from __future__ import annotations
 
 import hashlib
+import math
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from xalign_ros.io import ros_fields as ros
 from xalign_ros.io.ros_fields import Types
 
 KEYFRAME = "xalign_msgs/msg/Keyframe"
+NORMS = frozenset(Norm)
 QUAT_TOLERANCE = 1e-3  # of a quaternion's norm from 1; a sender's rounding is far smaller
 NO_FEATURES = Features(np.zeros((0, 2)), np.zeros((0, 0)))
 UNKNOWN_SIM3 = (np.full(3, np.nan), np.full(4, np.nan), float("nan"))
@@ -52,8 +54,7 @@ def keyframe_from_message(msg: Any) -> tuple[Keyframe | None, Rejection | None]:
         return Rejection(keyframe_id, session, stamp_ns, reason, detail)
 
     pose = ros.pose_seven(msg.pose.pose)
-    with np.errstate(over="ignore"):
-        norm = float(np.linalg.norm(pose[3:]))
+    norm = math.sqrt(sum(x * x for x in pose[3:].tolist()))  # too large a number is infinite
     if not np.isfinite(pose).all():
         return None, rejection("bad_pose", f"the pose is not finite: x y z qx qy qz qw = {pose.tolist()}")
     if abs(norm - 1) > QUAT_TOLERANCE:
@@ -94,7 +95,7 @@ def _features(msg: Any) -> Features | tuple[str, str]:
         if values.size not in (0, each * n):
             return "bad_pixel", f"{name} holds {values.size} numbers, {n} features need {each * n} or none"
     size, descriptors = int(msg.descriptor_bytes), ros.numbers(msg.descriptors, "B")
-    if int(msg.norm) not in list(Norm):
+    if int(msg.norm) not in NORMS:
         return "bad_descriptor", f"norm {int(msg.norm)} is unknown"
     norm = Norm(int(msg.norm))
     dtype = np.dtype(norm.dtype).newbyteorder("<")

@@ -87,7 +87,8 @@ def xyzw(msg: Any) -> Array:
 
 def pose_seven(pose: Any) -> Array:
     """(7,) of a Pose: position, quaternion x y z w."""
-    return np.concatenate([xyz(pose.position), xyzw(pose.orientation)])
+    p, q = pose.position, pose.orientation
+    return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w], float)
 
 
 def seven(T: SE3) -> Array:
@@ -147,29 +148,28 @@ def camera_from_info(info: Any) -> Camera | str:
     """The camera of a sensor_msgs/CameraInfo (K, D, size), or the sentence why there is none."""
     K = np.asarray(info.k if hasattr(info, "k") else info.K, float)
     D = np.asarray(info.d if hasattr(info, "d") else info.D, float)
-    model = DISTORTION_MODELS.get(str(info.distortion_model))
-    if model is None:
-        return f"distortion model '{info.distortion_model}' is none of {', '.join(filter(None, DISTORTION_MODELS))}"
-    if not K.any() or not info.width or not info.height:
-        return f"the camera has no intrinsics: K = {K.tolist()}, {info.width} x {info.height} px"
-    if K[1] != 0:
-        return f"the camera has skew {K[1]:g}, which no camera model here has"
-    try:
-        fx_fy_cx_cy = tuple(K[[0, 4, 2, 5]].tolist())
-        return _camera(model, fx_fy_cx_cy, tuple(D.tolist()), int(info.width), int(info.height))
-    except ValueError as error:
-        return str(error)
+    return _camera(str(info.distortion_model), K.tobytes(), D.tobytes(), int(info.width), int(info.height))
 
 
 @lru_cache(maxsize=16)
-def _camera(model: str, K: tuple[float, ...], D: tuple[float, ...], width: int, height: int) -> Camera:
+def _camera(distortion: str, K_bytes: bytes, D_bytes: bytes, width: int, height: int) -> Camera | str:
+    K, D, model = np.frombuffer(K_bytes), np.frombuffer(D_bytes), DISTORTION_MODELS.get(distortion)
+    if model is None:
+        return f"distortion model '{distortion}' is none of {', '.join(filter(None, DISTORTION_MODELS))}"
+    if not K.any() or not width or not height:
+        return f"the camera has no intrinsics: K = {K.tolist()}, {width} x {height} px"
+    if K[1] != 0:
+        return f"the camera has skew {K[1]:g}, which no camera model here has"
     if len(D) not in MODELS[model]:  # nothing but zeros may be missing or too many
         used = int(np.max(np.nonzero([1, *D])))
-        D = D[:used] + (0.0,) * (min((n for n in MODELS[model] if n >= used), default=used) - used)
-    with np.errstate(all="ignore"):
-        camera = Camera(model, np.array(K), np.array(D), width, height)
+        D = np.r_[D[:used], np.zeros(min((n for n in MODELS[model] if n >= used), default=used) - used)]
+    try:
+        with np.errstate(all="ignore"):
+            camera = Camera(model, K[[0, 4, 2, 5]], D, width, height)
+    except ValueError as error:
+        return str(error)
     if camera.limit <= 0:
-        raise ValueError(f"distortion {model} with D = {list(D)} lets no point through")
+        return f"distortion {model} with D = {D.tolist()} lets no point through"
     return camera
 
 
