@@ -1,9 +1,11 @@
-"""Logs: all recorded ones read or refused, the reader's rate beside its libraries; exit 1 on a miss. [--only NAME] [--json]"""
+"""Logs: all recorded ones read or refused, the reader's rate beside its libraries, a long replay; exit 1 on a miss. [--only NAME] [--json]"""
 
 from __future__ import annotations
 
+import json
 import re
 import sqlite3
+import subprocess
 import sys
 import tempfile
 import time
@@ -23,14 +25,17 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from xalign_ros.core.config import Config
 from xalign_ros.core.errors import LogError
-from xalign_ros.core.simulation import driving, world
+from xalign_ros.core.map_building import build_map
+from xalign_ros.core.simulation import driving, mapping, world
 from xalign_ros.io.log import Log, typestore
 from xalign_ros.io.messages import KEYFRAME
 from xalign_ros.io.msgdefs import message_definitions
+from xalign_ros.io.xmap import write_map
 
 REFUSED = {"asci-file.txt": "is no log: neither MCAP", "empty-file.bag": "is empty"}
 TAKEN_APART = 11  # times that a rate is measured
 DENSITY, FEATURES = 8.8, 460  # with the clutter 500 features a keyframe
+MINUTES, RATE_HZ = 20, 10
 
 
 def recorded(case: Case) -> None:
@@ -135,7 +140,45 @@ def by_rosbags(path: Path) -> Iterator[object]:
             yield reader.deserialize(data, connection.msgtype)
 
 
-CASES: dict[str, Callable[[Case], None]] = {"recorded": recorded, "rate": rate}
+# -- replay ----------------------------------------------------------------------------------------------------------
+
+
+def replay(case: Case) -> None:
+    """Twenty minutes at ten keyframes a second, of 500 features, in a map of 20,000 points: from command to exit."""
+    with tempfile.TemporaryDirectory() as work:
+        folder = Path(work)
+        built = world("corridor", 0, round(60 * MINUTES * RATE_HZ), DENSITY)
+        map_ = build_map(mapping(built, 0, 2 * FEATURES), built.mapped, map_id="long", source="simulated", metric=True)
+        write_map(map_, folder / "m.xmap")
+        noise, period_ns = Config().odometry, round(1e9 / RATE_HZ)
+        run_of = driving(built, 0, noise, metric=False, features=FEATURES, period_ns=period_ns)
+        real_data.write_keyframes(folder / "run.mcap", run_of)
+        real_data.write_poses(folder / "run.tum", run_of, built.driven)
+        words = [
+            sys.executable,
+            "-m",
+            "xalign_ros",
+            "replay",
+            "run.mcap",
+            "--map",
+            "m.xmap",
+            "--truth",
+            "run.tum",
+            "--json",
+        ]
+        start = time.perf_counter()
+        result = json.loads(subprocess.run(words, cwd=folder, check=True, capture_output=True, text=True).stdout)
+        wall_s = time.perf_counter() - start
+    case.figure("points of the map", len(map_.points), low=20_000)
+    case.figure("features of a keyframe, mean", float(np.mean([len(k.features) for k in run_of])), low=490)
+    case.figure("times real time, end to end", 60 * MINUTES / wall_s, low=20)
+    case.figure("step p50, ms", result["step_ms"]["p50"])
+    case.figure("step p99, ms", result["step_ms"]["p99"])
+    case.figure("coverage", result["coverage"], low=1.0)
+    case.figure("median error, m", result["ate_median_m"], high=0.01)
+
+
+CASES: dict[str, Callable[[Case], None]] = {"recorded": recorded, "rate": rate, "replay": replay}
 
 if __name__ == "__main__":
     sys.exit(run(__doc__, CASES))

@@ -160,6 +160,14 @@ def test_two_runs_are_equal_to_the_last_bit(replayed):
         assert same(a, b)
 
 
+def test_without_the_windows_poses_all_else_is_the_same(replayed):
+    run, steps = replayed["line"]
+    aligner = Aligner(worlds.line().map, CONFIG, window_poses=False)
+    for a, k in zip(steps, run.keyframes, strict=True):
+        b = aligner.step(k)
+        assert b.poses == () and same(a, b, but=("poses",))
+
+
 def not_a_number(k):
     return replace(k, T_odom_cam=SE3(k.T_odom_cam.R, [np.nan, 0, 0]))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from types import ModuleType
@@ -33,6 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if words[:1] == ["node"]:  # its arguments are ROS's
         return int(importlib.import_module("xalign_ros.apps.node").main(words[1:]) or 0)
+    if words[:1] == ["replay"]:  # its matrices are small: threads would cost a quarter, and bits on other machines
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is imported
     own = words[:1] and words[0] in OWN_SYNTAX
     parser = argparse.ArgumentParser(prog="xalign", description="Put a running odometry source onto a map.")
     parser.add_argument("--version", action="version", version=f"xalign {xalign_ros.__version__}")

@@ -32,12 +32,16 @@ TOGETHER = 5  # keyframes that are looked for at once
 
 
 class Aligner:
-    """One map, one odometry; `step` once per keyframe, in order of arrival."""
+    """One map, one odometry; `step` once per keyframe, in order of arrival.
 
-    def __init__(self, map_: ReferenceMap, config: Config | None = None) -> None:
+    Without window_poses, which cost as much as the window's update, Step.poses stays empty and all else is the same.
+    """
+
+    def __init__(self, map_: ReferenceMap, config: Config | None = None, window_poses: bool = True) -> None:
         self.config = config or Config()
         self.index = MapIndex(map_)
         self.belief = Belief(self.config)
+        self._window_poses = window_poses
         self._published: Sim3 | None = None  # the last S_map_odom, for a jump to start from
         self._sightings: deque[Sighting] = deque(maxlen=TOGETHER)  # of the newest keyframes, while there is no lock
         self._hint: Hint | None = None  # given since the last keyframe
@@ -167,7 +171,7 @@ class Aligner:
             rejection,
             believed,
             predicted[0].rigid_pose() if predicted else None,
-            self.belief.poses(),
+            self.belief.poses() if self._window_poses else (),
         )
 
     def _state(self, session: int, stamp_ns: int) -> AlignmentState:
