@@ -1,4 +1,4 @@
-"""Logs: all recorded ones read or refused, the reader's rate beside its libraries, a long replay; exit 1 on a miss. [--only NAME] [--json]"""
+"""Logs: recorded ones read or refused, the reader beside its libraries, a long replay; exit 1 on a miss. [--only N] [--json]"""
 
 from __future__ import annotations
 

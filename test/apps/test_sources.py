@@ -105,9 +105,19 @@ def test_batch_takes_the_same_sources(logs, tmp_path, capsys):
 def test_log_info_says_what_a_log_can_serve(logs, capsys):
     for kind in ENTRIES:
         assert main(["log", "info", str(logs / f"{kind}.mcap")]) == 0
-        assert f"--source`: {kind}\n" in capsys.readouterr().out
+        assert f"--source {kind}: " in capsys.readouterr().out
     assert main(["log", "info", str(logs / "vins.mcap"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["sources"] == ["vins"]
+    told = json.loads(capsys.readouterr().out)
+    assert told["sources"] == ["vins"] and set(told["taken"]["vins"]) >= {"pose", "extrinsic"}
+    pose = next(t for t in told["topics"] if t["name"] == told["taken"]["vins"]["pose"])
+    assert pose["last_ns"] - pose["first_ns"] == round(1e9 * pose["duration_s"]) > 0
+    assert pose["rate_hz"] == pytest.approx((pose["messages"] - 1) / pose["duration_s"])
+
+
+def test_log_info_says_why_a_source_would_not_do(logs, tmp_path, capsys):
+    write_source_log(tmp_path / "run.mcap", without(INFO)())
+    assert main(["log", "info", str(tmp_path / "run.mcap")]) == 0
+    assert "--source odometry: " in (out := capsys.readouterr().out) and "give the calibration by --camera FILE" in out
 
 
 def without(kind):

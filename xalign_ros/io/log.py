@@ -117,6 +117,14 @@ class Log:
         """All topics by name, with the number of messages the log announces."""
         return [Topic(name, kind, count) for (name, kind), count in sorted(self._announced.items())]
 
+    def spans(self) -> dict[tuple[str, str], tuple[int, int]]:
+        """First and last log time (ns) by name and type of each topic that has a message; reads them all."""
+        found: dict[tuple[str, str], tuple[int, int]] = {}
+        for connection, time_ns, _ in self._read(set(self._announced)):
+            key = connection.topic, connection.msgtype
+            found[key] = found.get(key, (time_ns, time_ns))[0], time_ns
+        return found
+
     def keyframe_topic(self, asked: str | None = None) -> str:
         """The topic of xalign_msgs/msg/Keyframe: the asked one (a leading slash does not matter) or the only one."""
         names = [topic.name for topic in self.topics() if topic.type == KEYFRAME]

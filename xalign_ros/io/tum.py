@@ -104,13 +104,14 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
         raise ValueError("a trajectory to write has a pose that is not finite")
     rows = np.hstack([trajectory.t, quat_from_rotation(trajectory.R)]) + 0.0  # no "-0.000000000" from -0.0
     lines = [
-        f"{_seconds(stamp)} {' '.join(f'{x:.9f}' for x in row)}\n"
+        f"{seconds_text(stamp)} {' '.join(f'{x:.9f}' for x in row)}\n"
         for stamp, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True)
     ]
     write_text(path, lines)
 
 
-def _seconds(stamp: int) -> str:
+def seconds_text(stamp: int) -> str:
+    """ns as seconds with nine decimals."""
     seconds, rest = divmod(abs(stamp), 1_000_000_000)
     return f"{'-' if stamp < 0 else ''}{seconds}.{rest:09d}"
 
