@@ -13,22 +13,25 @@ from xalign_ros.core.errors import FormatError
 from xalign_ros.core.lie import Array
 from xalign_ros.core.trajectory_errors import trajectory_errors
 from xalign_ros.io.corrections import read_corrections
-from xalign_ros.io.tum import Trajectory, pose_at, read_tum
+from xalign_ros.io.trajectory_files import read_trajectory
+from xalign_ros.io.tum import Trajectory, pose_at
 
 LOGS = (".mcap", ".db3", ".bag")
 HOLE = 3.0  # times the usual gap between poses, from which on nothing is covered
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("estimate", type=Path, metavar="EST", help="TUM file of T_map_cam, or an output log of replay")
-    parser.add_argument("truth", type=Path, metavar="TRUTH", help="TUM file of the true T_map_cam")
+    parser.add_argument(
+        "estimate", type=Path, metavar="EST", help="TUM or EuRoC (.csv) file of T_map_cam, or a log of replay"
+    )
+    parser.add_argument("truth", type=Path, metavar="TRUTH", help="TUM or EuRoC (.csv) file of the true T_map_cam")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of words")
 
 
 def run(args: argparse.Namespace) -> None:
     log = args.estimate.is_dir() or args.estimate.suffix.lower() in LOGS
-    estimate, cov = read_corrections(args.estimate) if log else (read_tum(args.estimate), None)
-    truth = read_tum(args.truth)
+    estimate, cov = read_corrections(args.estimate) if log else (read_trajectory(args.estimate), None)
+    truth = read_trajectory(args.truth)
     for path, trajectory in ((args.estimate, estimate), (args.truth, truth)):
         if not len(trajectory):
             raise FormatError(f"{path} holds no pose")

@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, metavar="OUT.mcap", help="log of corrections, anchors, states, poses"
     )
-    parser.add_argument("--trajectory", type=Path, metavar="OUT.tum", help="poses as known at each keyframe's own time")
+    told = "poses as known at each keyframe's own time: TUM, or by its ending .csv (EuRoC) or .kitti"
+    parser.add_argument("--trajectory", type=Path, metavar="OUT.tum", help=told)
     parser.add_argument("--truth", type=Path, metavar="TUM_FILE", help="true T_map_cam; adds the errors to the result")
     parser.add_argument("--report", type=Path, metavar="DIR", help="folder for a report with pictures")
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with options that differ from the defaults")

@@ -17,7 +17,8 @@ from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io.log import LogWriter
 from xalign_ros.io.step_messages import TOPICS
-from xalign_ros.io.tum import Trajectory, pose_at, read_tum, write_tum
+from xalign_ros.io.trajectory_files import write_trajectory
+from xalign_ros.io.tum import Trajectory, pose_at, read_tum
 
 
 @dataclass(slots=True)
@@ -87,7 +88,7 @@ def write_results(
     if true is not None:
         result |= summarize_errors(run.steps, run.odometry, true)
     if trajectory:
-        write_tum(trajectory, _trajectory(run.steps))
+        write_trajectory(trajectory, _trajectory(run.steps))
     if report:
         from xalign_ros.io.report import write_report
 
