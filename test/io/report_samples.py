@@ -22,7 +22,7 @@ from xalign_ros.io.report import write_report
 
 STEP_NS = 500_000_000
 START_NS = 1_403_636_579_763_555_584
-PICTURES = {"top_view.png", "error.png", "scale.png", "anchors.png", "step_time.png"}
+PICTURES = {"top_view.png", "space_view.png", "error.png", "scale.png", "anchors.png", "step_time.png"}
 LEVEL = SE3(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))  # T_map_cam looking along y, z up
 U, C, L, G, X = State.UNINITIALIZED, State.CANDIDATE, State.LOCALIZED, State.COASTING, State.LOST
 STORY = [U, C, C] + 12 * [L] + 5 * [G] + 4 * [X] + 8 * [L]

@@ -104,7 +104,8 @@ def test_figures_stand_in_the_page_with_meaning_and_unit(folder):
     assert "bad pixel features lie outside the image 4" in text
     assert "LOST too uncertain, or the odometry started anew; no pose is published 2 s" in text
     assert "Locked after 3 keyframes (1.5 s); 86.2 % of the keyframes from there on have a pose." in text
-    assert "The position error is 0.03 m (root mean square)" in text
+    assert "LOCALIZED for 61 % of 16 s, and at the end. Locked" in text
+    assert "The position error is half of the time within " in text and " m, 0.03 m (root mean square)" in text
 
 
 def test_every_figure_reason_and_state_is_explained():
@@ -269,7 +270,9 @@ def test_a_browser_shows_it(folder, tmp_path, width):
     flags += "--disable-background-networking --disable-component-update --disable-sync".split()
     flags += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}"]
     shot = [f"--window-size={width},1600", f"--screenshot={tmp_path / 'shot.png'}", (folder / "index.html").as_uri()]
-    subprocess.run([browser, *flags, *shot], check=True, capture_output=True, timeout=60)
+    flags.append("--enable-logging=stderr")
+    done = subprocess.run([browser, *flags, *shot], check=True, capture_output=True, timeout=60)
+    assert b"CONSOLE" not in done.stderr, done.stderr.decode()
     image = imread(tmp_path / "shot.png")[..., :3]
     assert image.shape[:2] == (1600, width)
     assert (image[:, :4] == 1).all() and (image[:, -4:] == 1).all()  # margins: dark on light, nothing runs over

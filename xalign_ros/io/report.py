@@ -80,10 +80,17 @@ def _lead(run: Run, result: dict[str, Any]) -> str:
         return f"Never locked: {run.steps[-1].state.reason}. No pose was published."
     first, seconds = result.get("first_lock_keyframe"), _number(result["first_lock_s"], 3)
     covered = f"{100 * result.get('coverage', 0.0):.3g} % of the keyframes from there on have a pose"
-    text = f"Locked after {first} keyframes ({seconds} s); {covered}."
+    spent = result.get("state_seconds") or {}
+    share = spent.get(State.LOCALIZED.name, 0.0) / (sum(spent.values()) or 1.0)
+    end = run.steps[-1].state.state
+    text = f"LOCALIZED for {100 * share:.0f} % of {run.end:.0f} s"
+    text += ", and at the end. " if end is State.LOCALIZED else f", but {end.name} at the end. "
+    text += f"Locked after {first} keyframes ({seconds} s); {covered}."
     ate, raw = result.get("ate_rmse_m"), result.get("raw_ate_rmse_m")
     if ate is not None:
-        text += f" The position error is {_number(ate, 3)} {run.unit} (root mean square)"
+        median = result.get("ate_median_m")
+        half = "" if median is None else f"half of the time within {_number(median, 3)} {run.unit}, "
+        text += f" The position error is {half}{_number(ate, 3)} {run.unit} (root mean square)"
         text += "." if raw is None else f"; the odometry alone, fitted in hindsight, has {_number(raw, 3)} {run.unit}."
     return text
 

@@ -10,6 +10,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from xalign_ros.core.evaluation import errors
 from xalign_ros.core.lie import Array
@@ -140,6 +141,46 @@ def _top_view(run: Run) -> Figure:
     return _legend(figure, "")
 
 
+def _space_view(run: Run) -> Figure:
+    """The run from aslant: what the view from above cannot tell, heights and tilted ways."""
+    axes, _ = plane(
+        (path := np.vstack([run.published, run.true]))[np.isfinite(path).all(axis=1)], run.map, run.map.points
+    )
+    turn = np.vstack([axes, np.cross(axes[0], axes[1])]).T
+    shown = path[np.isfinite(path).all(axis=1)] if np.isfinite(path).all(axis=1).any() else run.map.keyframe_t
+    shown = shown @ turn
+    middle, half = (shown.min(axis=0) + shown.max(axis=0)) / 2, 0.55 * np.ptp(shown, axis=0)
+    half = np.maximum(half, 0.25 * half.max() or 1.0)
+    figure = Figure((WIDTH_IN, 3.8))
+    ax: Any = figure.add_subplot(projection="3d", computed_zorder=False)
+    ax.set_title("The run in space", loc="left")
+
+    def draw(x: Array, style: str, label: str, color: str, **more: Any) -> None:
+        local = x @ turn
+        inside = np.isfinite(local).all(axis=1) & (np.abs(np.nan_to_num(local) - middle) <= 1.05 * half).all(axis=1)
+        if inside.any():
+            style_of = {"label": label, "color": color, "clip_on": False, **more}
+            for line in ax.plot(*np.where(inside[:, None], local, np.nan).T, style, **style_of):
+                line.set_in_layout(False)  # the axes are larger
+
+    points = np.asarray(run.map.points[:: len(run.map.points) // (MAP_POINTS // 4) + 1])
+    draw(points, ".", "map points", GREY, ms=1, alpha=0.35)
+    draw(run.true, "-", "truth", INK, lw=4, alpha=0.3)
+    for mine, S in run.fits:
+        draw(np.where(mine[:, None], S.apply(positions(run.odometry)), np.nan), "--", "odometry, fitted", SKY, lw=1.1)
+    draw(run.published, "-", "corrected", BLUE)
+    draw(positions(s.anchor.T_map_cam if s.anchor else None for s in run.steps), ".", "anchor, accepted", GREEN, ms=3.5)
+    refused = (s.rejection.anchor if s.rejection else None for s in run.steps)
+    draw(positions(a.T_map_cam if a else None for a in refused), "x", "anchor, rejected", RED, ms=4.5, mew=1.1)
+    for n, name in enumerate("xyz"):
+        getattr(ax, f"set_{name}lim")(middle[n] - half[n], middle[n] + half[n])
+        getattr(ax, f"set_{name}label")(f"{('along', 'across', 'up')[n]} ({run.unit})", labelpad=(14, 8, 2)[n])
+        getattr(ax, f"{name}axis").set_major_locator(MaxNLocator((5, 3, 3)[n]))
+    ax.set_box_aspect(half / half.max(), zoom=1.2)
+    ax.view_init(elev=28, azim=-62)
+    return _legend(figure, "")
+
+
 def _error(run: Run) -> Figure:
     labels = f"position ({run.unit})", "rotation (°)"
     figure, axes = _over_time(run, "Error of each pose as known at its own time", (1.7, 1.7), labels)
@@ -215,6 +256,10 @@ PICTURES = {  # file name: how it is drawn, what is seen in it
         _top_view,
         "Where the run went. The odometry is drawn after its best fit in hindsight: to the truth, or to the corrected "
         "poses where there is no truth. While LOST a position was estimated, but not published.",
+    ),
+    "space_view.png": (
+        _space_view,
+        "The same from aslant, its axes along and across the run and up; what lies outside the box is left out.",
     ),
     "error.png": (_error, "Distance and angle between pose and truth, not aligned, and what the covariance predicted."),
     "scale.png": (_scale, "The length of one odometry unit in the map. It drifts where the odometry is not metric."),
