@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
 import sqlite3
@@ -16,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import real_data
 from case import Case, run
+from log_damage import damaged, read
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
@@ -26,6 +29,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from xalign_ros.core.config import Config
 from xalign_ros.core.errors import LogError
 from xalign_ros.core.map_building import build_map
+from xalign_ros.core.records import Keyframe
 from xalign_ros.core.simulation import driving, mapping, world
 from xalign_ros.io.log import Log, typestore
 from xalign_ros.io.messages import KEYFRAME
@@ -36,6 +40,7 @@ REFUSED = {"asci-file.txt": "is no log: neither MCAP", "empty-file.bag": "is emp
 TAKEN_APART = 11  # times that a rate is measured
 DENSITY, FEATURES = 8.8, 460  # with the clutter 500 features a keyframe
 MINUTES, RATE_HZ = 20, 10
+DAMAGED = 50_000
 
 
 def recorded(case: Case) -> None:
@@ -140,6 +145,47 @@ def by_rosbags(path: Path) -> Iterator[object]:
             yield reader.deserialize(data, connection.msgtype)
 
 
+# -- damage ----------------------------------------------------------------------------------------------------------
+
+
+def damage(case: Case) -> None:
+    """Damaged files of each format: one sentence of ours, or keyframes; of MCAP, which has checksums, the right ones."""
+    small = driving(world("hall", 0, 10), 0, Config().odometry, metric=False, features=3)[:6]
+    traces, wrong, slowest = list[str](), 0, 0.0
+    with tempfile.TemporaryDirectory() as work:
+        mcap, folder, bag = Path(work, "run.mcap"), Path(work, "run"), Path(work, "run.bag")
+        real_data.write_keyframes(mcap, small)
+        _copied(mcap, folder, bag)
+        wholes = [path.read_bytes() for path in (mcap, folder / "run.db3", bag)]
+        path, right = Path(work, "damaged"), [_told(k) for k in read(mcap)[0]]
+        for seed in range(DAMAGED):
+            whole = wholes[seed % len(wholes)]
+            path.write_bytes(damaged(whole, seed // len(wholes)))
+            start, said = time.perf_counter(), io.StringIO()
+            try:
+                with contextlib.redirect_stderr(said):
+                    found, error = read(path)
+            except Exception as unexpected:
+                traces.append(f"{seed}: {unexpected!r}")
+                continue
+            slowest = max(slowest, time.perf_counter() - start)
+            wrong += "\n" in error
+            if whole is wholes[0]:
+                told = [_told(k) for k in found]
+                wrong += told != right[: len(told)] or (len(told) < len(right) and not error and not said.getvalue())
+    for trace in traces[:10]:
+        print(f"seed {trace}", file=sys.stderr)
+    case.figure(f"other errors than ours, of {DAMAGED} damaged files", len(traces), high=0)
+    case.figure("wrong keyframes out of MCAP, or fewer in silence", wrong, high=0)
+    case.figure("slowest, s", slowest, high=5)
+
+
+def _told(keyframe: object) -> tuple[object, ...]:
+    assert isinstance(keyframe, Keyframe)
+    f = keyframe.features
+    return keyframe.id, keyframe.stamp_ns, keyframe.T_odom_cam.t.tobytes(), f.uv.tobytes(), f.descriptors.tobytes()
+
+
 # -- replay ----------------------------------------------------------------------------------------------------------
 
 
@@ -178,7 +224,7 @@ def replay(case: Case) -> None:
     case.figure("median error, m", result["ate_median_m"], high=0.01)
 
 
-CASES: dict[str, Callable[[Case], None]] = {"recorded": recorded, "rate": rate, "replay": replay}
+CASES: dict[str, Callable[[Case], None]] = {"recorded": recorded, "rate": rate, "damage": damage, "replay": replay}
 
 if __name__ == "__main__":
     sys.exit(run(__doc__, CASES))
