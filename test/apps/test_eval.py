@@ -82,6 +82,9 @@ def test_a_run_and_its_output_log_have_the_errors_that_replay_says(tmp_path: Pat
         assert r["not_aligned"]["rmse_deg"] == pytest.approx(said["rot_rmse_deg"], rel=1e-4) and r["wrong"] == 0
     r = result_of(tmp_path / "o.mcap", sim / "truth.tum", capsys)
     assert r["nees_mean"] == pytest.approx(said["nees_mean"], rel=0.02) and 0.5 < r["within_2_sigma"] <= 1
+    assert r["anchors"]["accepted"] == said["anchors_accepted"] and r["anchors"]["precision"] == 1.0
+    assert main(["eval", str(tmp_path / "o.mcap"), str(sim / "truth.tum")]) == 0
+    assert "precision 1" in capsys.readouterr().out
 
 
 def test_what_cannot_be_compared_is_one_sentence(tmp_path: Path, capsys) -> None:

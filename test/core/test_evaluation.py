@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from xalign_ros.core.evaluation import errors, jumped, raw_error, summarize, summarize_errors
-from xalign_ros.core.records import AlignmentState, Correction, Rejection, State, Step
+from xalign_ros.core.records import AlignmentState, Anchor, Correction, Rejection, State, Step
+from xalign_ros.core.trajectory_errors import anchor_errors
 from xalign_ros.core.transforms import SE3, Sim3
 
 SECOND = 10**9
@@ -92,3 +93,19 @@ def test_a_jump_is_measured_against_the_prediction_not_the_last_pose() -> None:
         9, 0, 9 * SECOND, Sim3(SE3.exp([0, 0, 0.2, 0, 0, 0]).R, [0, 0, 0], 1), np.eye(7), at(9), np.eye(6)
     )
     assert jumped(a, turned)
+
+
+def test_anchors_right_and_wrong_accepted_and_refused() -> None:
+    near, far = at(0.0), at(0.6)
+
+    def anchor(T: SE3) -> Anchor:
+        return Anchor(0, 0, 0, T, np.eye(6), 30, 20, 1.0)
+
+    def refused(T: SE3 | None) -> Rejection:
+        return Rejection(0, 0, 0, "inconsistent", "", anchor=None if T is None else anchor(T))
+
+    outcomes = [*[anchor(near)] * 3, anchor(far), refused(near), refused(far), refused(None), anchor(near)]
+    found = anchor_errors(outcomes, [near] * 7 + [None])
+    assert (found["accepted"], found["accepted_wrong"], found["refused_right"], found["refused_wrong"]) == (4, 1, 1, 1)
+    assert found["precision"] == found["recall"] == 0.75
+    assert anchor_errors([], [])["precision"] is None

@@ -11,8 +11,8 @@ import numpy as np
 
 from xalign_ros.core.errors import FormatError
 from xalign_ros.core.lie import Array
-from xalign_ros.core.trajectory_errors import trajectory_errors
-from xalign_ros.io.corrections import read_corrections
+from xalign_ros.core.trajectory_errors import anchor_errors, trajectory_errors
+from xalign_ros.io.corrections import read_anchors, read_corrections
 from xalign_ros.io.trajectory_files import read_trajectory
 from xalign_ros.io.tum import Trajectory, pose_at
 
@@ -42,6 +42,9 @@ def run(args: argparse.Namespace) -> None:
             f"no pose of {args.estimate} ({spans[0]}) has a truth in {args.truth} ({spans[1]}) within 1 ms or between rows "
             "0.1 s apart; give files of one clock"
         )
+    if log:
+        anchors = read_anchors(args.estimate)
+        result["anchors"] = anchor_errors(anchors, [pose_at(truth, anchor.stamp_ns) for anchor in anchors])
     print(json.dumps(result) if args.json else "\n".join(_lines(result)))
 
 
@@ -74,6 +77,6 @@ def _lines(result: dict[str, Any]) -> list[str]:
     lines = []
     for key, value in result.items():
         if isinstance(value, dict):
-            value = "  ".join(f"{k} {v:.4g}" for k, v in value.items())
+            value = "  ".join(f"{k} {'-' if v is None else f'{v:.4g}'}" for k, v in value.items())
         lines.append(f"{key:20s} {'-' if value is None else f'{value:.4g}' if isinstance(value, float) else value}")
     return lines

@@ -6,12 +6,16 @@ Umeyama's (PAMI 1991).
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from xalign_ros.core.lie import Array, so3_log
+from xalign_ros.core.records import Anchor, Rejection
 from xalign_ros.core.similarity import fit_similarity
+from xalign_ros.core.transforms import SE3
 
 WRONG_M, WRONG_RAD = 0.5, float(np.deg2rad(5.0))
 
@@ -46,6 +50,30 @@ def trajectory_errors(R: Array, t: Array, R_true: Array, t_true: Array, cov: Arr
         nees = np.einsum("ni,ni->n", d, np.linalg.solve(cov, d[..., None])[..., 0])
         out["nees_mean"], out["within_2_sigma"] = float(nees.mean()), float((nees < 12.85).mean())  # 95.45 % of chi2(6)
     return out
+
+
+def anchor_errors(outcomes: Sequence[Anchor | Rejection], truth: Sequence[SE3 | None]) -> dict[str, Any]:
+    """How many anchors with a truth were right (within WRONG_M and WRONG_RAD), accepted and refused.
+
+    precision: part of the accepted that is right; recall: part of the right ones that was accepted. None of nothing.
+    """
+    count: Counter[tuple[bool, bool]] = Counter()
+    for outcome, true in zip(outcomes, truth, strict=True):
+        found = outcome if isinstance(outcome, Anchor) else outcome.anchor
+        if found is not None and true is not None:
+            T = found.T_map_cam
+            turn = float(_angle(T.R.T @ true.R))
+            is_right = float(np.linalg.norm(T.t - true.t)) <= WRONG_M and turn <= WRONG_RAD
+            count[isinstance(outcome, Anchor), is_right] += 1
+    accepted, right = count[True, True] + count[True, False], count[True, True] + count[False, True]
+    return {
+        "accepted": accepted,
+        "accepted_wrong": count[True, False],
+        "refused_right": count[False, True],
+        "refused_wrong": count[False, False],
+        "precision": count[True, True] / accepted if accepted else None,
+        "recall": count[True, True] / right if right else None,
+    }
 
 
 def _steps(R: Array, t: Array) -> tuple[Array, Array]:

@@ -8,12 +8,14 @@ import numpy as np
 
 from xalign_ros.core.errors import LogError
 from xalign_ros.core.lie import Array
+from xalign_ros.core.records import Anchor, Rejection
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io.log import Log
+from xalign_ros.io.messages import anchor_from_message
 from xalign_ros.io.ros_fields import covariance_from_ros, pose_seven, stamp_of
 from xalign_ros.io.tum import Trajectory
 
-CORRECTION = "xalign_msgs/msg/Correction"
+CORRECTION, ANCHOR = "xalign_msgs/msg/Correction", "xalign_msgs/msg/Anchor"
 
 
 def read_corrections(path: Path) -> tuple[Trajectory, Array]:
@@ -38,3 +40,17 @@ def read_corrections(path: Path) -> tuple[Trajectory, Array]:
     R, t = (np.array([getattr(T, part) for T, _ in rows]) for part in ("R", "t"))
     cov = np.array([c for _, c in rows]).reshape(-1, 6, 6)
     return Trajectory(np.array(sorted(found), np.int64), R.reshape(-1, 3, 3), t.reshape(-1, 3)), cov
+
+
+def read_anchors(path: Path) -> list[Anchor | Rejection]:
+    """What became of each keyframe's anchor, in order; none where the log has no such topic. Raises LogError."""
+    with Log(path) as log:
+        names = [topic.name for topic in log.topics() if topic.type == ANCHOR]
+        found = []
+        for message in log.raw_messages(names[:1]):
+            try:
+                found.append(anchor_from_message(message.message()))
+            except Exception as error:
+                where = f"the message on {message.topic} at {message.log_time_ns} ns"
+                raise LogError(f"{path} is damaged: {where} is no {ANCHOR}") from error
+    return found
