@@ -13,7 +13,21 @@ def aligner(context):
     # An empty argument leaves the map of the parameter file standing.
     if path := LaunchConfiguration("map").perform(context):
         overrides["map"] = path
-    return [
+    if source := LaunchConfiguration("source").perform(context):
+        overrides["source"] = source
+    views = []
+    if LaunchConfiguration("rviz").perform(context) == "true":
+        layout = PathJoinSubstitution([FindPackageShare("xalign_ros"), "config", "xalign.rviz"])
+        views.append(
+            Node(
+                package="rviz2",
+                executable="rviz2",
+                namespace=LaunchConfiguration("namespace"),
+                arguments=["-d", layout],
+                remappings=[("/tf", "tf"), ("/tf_static", "tf_static")],
+            )
+        )
+    return views + [
         Node(
             package="xalign_ros",
             executable="xalign_node",
@@ -38,6 +52,8 @@ def generate_launch_description():
                 description="parameter file (YAML)",
             ),
             DeclareLaunchArgument("map", default_value="", description="folder NAME.xmap; wins over params_file"),
+            DeclareLaunchArgument("source", default_value="", description="keyframes, odometry, vins or openvins"),
+            DeclareLaunchArgument("rviz", default_value="false", description="show it in RViz"),
             DeclareLaunchArgument("use_sim_time", default_value="false", description="follow /clock"),
             OpaqueFunction(function=aligner),
         ]
