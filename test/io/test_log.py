@@ -189,6 +189,13 @@ def test_log_defines_another_keyframe(old, new, words, tmp_path):
         next(log.keyframes())
 
 
+def test_a_bag_of_ros_1_defines_another_header(tmp_path):
+    path = KINDS["rosbag1"](tmp_path, some_keyframes(1))
+    path.write_bytes(path.read_bytes().replace(b"time stamp\n", b"time stomp\n"))
+    with Log(path) as log, pytest.raises(LogError, match="another std_msgs/msg/Header than we know: stomp frame_id"):
+        next(log.keyframes())
+
+
 def test_log_without_definitions_is_read_with_ours(tmp_path):
     folder = write_rosbag2(tmp_path / "run", some_keyframes())
     with sqlite3.connect(folder / "run.db3") as connection:

@@ -35,8 +35,10 @@ def defined(kind: str, text: str, seq: bool = False) -> tuple[Typestore, str]:
     if HEADER in types and not seq:
         types[HEADER] = typestore().fielddefs[HEADER]
     store.register(types)
-    for name in sorted(types.keys() - {HEADER}) if kind == KEYFRAME else ():
+    for name in sorted(types) if kind == KEYFRAME else ():
         theirs, ours = (_fields(known.fielddefs.get(name, ((), ()))[1]) for known in (store, typestore()))
+        if name == HEADER:
+            theirs = [field for field in theirs if field[0] != "seq"]
         if ours != theirs:
             return store, f"{name} than we know: {' '.join(field for field, _ in theirs)}"
     return store, ""
