@@ -21,7 +21,7 @@ setup(
         # The marker by which ament finds the package; kept inside the package, so the tree has no top-level resource/.
         ("share/ament_index/resource_index/packages", [f"{NAME}/resource/{NAME}"]),
         (SHARE, ["package.xml"]),
-        (f"{SHARE}/config", sorted(glob("config/*.yaml") + glob("config/*.json") + glob("config/*.launch.py"))),
+        (f"{SHARE}/config", sorted(glob("config/*"))),
         # The message texts for ROS-free replay (io/msgdefs.py). Not share/xalign_msgs: the compiled package owns that.
         (f"{SHARE}/msg", sorted(glob("msg_defs/msg/*.msg"))),
     ],
