@@ -27,7 +27,8 @@ def aligner(context):
                 remappings=[("/tf", "tf"), ("/tf_static", "tf_static")],
             )
         )
-    return views + [
+    return [
+        *views,
         Node(
             package="xalign_ros",
             executable="xalign_node",
@@ -37,7 +38,7 @@ def aligner(context):
             # Under a namespace each robot has its own tree.
             remappings=[("/tf", "tf"), ("/tf_static", "tf_static")],
             output="screen",
-        )
+        ),
     ]
 
 
