@@ -6,6 +6,7 @@ Both processes are ours and talk through a pipe of their own: a method's name an
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -42,6 +43,7 @@ class MapProcess:
 
     def __init__(self, path: Path, terms: Terms) -> None:
         self.path, self.terms = path, terms
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its matrices are small; and as in replay, to the last bit
         spawn = multiprocessing.get_context("spawn")
         self._pipe, theirs = spawn.Pipe()
         self._process = spawn.Process(target=_serve, args=(theirs, path, terms), name="xalign_aligner", daemon=True)
