@@ -36,6 +36,25 @@ def test_no_wrong_pose_is_localized_and_the_run_ends_localized(name, simulated) 
     assert step.state.state is State.LOCALIZED and np.median(errors) < 0.01
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_an_odometry_that_claims_metres_is_overruled_where_its_scale_breaks(seed) -> None:
+    """Six anchors agree on another scale; until then the state says that nothing confirms the pose."""
+    built = world("corridor", seed, 60)
+    map_ = build_map(mapping(built, seed), built.mapped, map_id="m", source="s", metric=True)
+    aligner, states, errors = Aligner(map_), [], []
+    run = driving(built, seed, Config().odometry, metric=True)
+    for _, keyframe in faulty(run, "scale_step", seed):
+        step = aligner.step(keyframe)
+        states.append(step.state)
+        T = step.correction.T_map_cam if step.correction is not None else None
+        errors.append(np.nan if T is None else np.linalg.norm(T.t - built.driven[keyframe.id].t))
+    wrong = [s for s, error in zip(states, errors, strict=True) if error > 0.5]
+    assert 0 < len(wrong) < 10 and {s.state for s in wrong} == {State.COASTING}
+    assert "contradict the odometry" in wrong[0].reason
+    assert states[-1].state is State.LOCALIZED and errors[-1] < 0.05
+    assert states[-1].S_map_odom.s == pytest.approx(1 / 1.5, rel=0.05)
+
+
 def test_the_same_seed_breaks_the_same_and_the_run_stays_as_it_was(simulated) -> None:
     _, run, _ = simulated
     for name in FAULTS:
