@@ -46,21 +46,6 @@ def rms(x: Array) -> float:
     return float(np.sqrt((x**2).sum(axis=1).mean()))
 
 
-def of_poses(poses: list[SE3]) -> Reconstruction:
-    """Views alone."""
-    n = len(poses)
-    nothing = (
-        np.zeros(0, int),
-        np.zeros((0, 3)),
-        np.zeros(0, bool),
-        np.zeros(1, int),
-        np.zeros(0, int),
-        np.zeros((0, 2)),
-    )
-    R, t = np.array([T.R for T in poses]), np.array([T.t for T in poses])
-    return Reconstruction(np.arange(n), tuple(map(str, range(n))), R, t, np.ones(n, bool), *nothing)
-
-
 def drifting(seed: int) -> tuple[Reconstruction, dict[int, Anchor], Array, set[int]]:
     """A run on a winding way, its anchors by row, its true positions, and the rows whose anchor is wrong."""
     rng = np.random.default_rng(seed)
@@ -82,7 +67,7 @@ def drifting(seed: int) -> tuple[Reconstruction, dict[int, Anchor], Array, set[i
         if row in wrong:
             T = SE3(so3_exp(rng.normal(size=3)), t[rng.integers(VIEWS)] + rng.normal(0, 2, 3))
         anchors[row] = Anchor(row, 0, row, T, cov, 100, 60, 1.0)
-    return of_poses(at), anchors, t, wrong
+    return Reconstruction.of_views(np.array([T.R for T in at]), np.array([T.t for T in at])), anchors, t, wrong
 
 
 def pytheia(work: Path, source: Reconstruction, anchors: Mapping[int, Anchor]) -> Array:
@@ -123,7 +108,8 @@ def tango(case: Case, work: Path) -> None:
     map_ = build_map(keyframes[SEGMENT], poses[SEGMENT], map_id="segment", source="tango", metric=True)
     index, config = MapIndex(map_), Config()
     G = Sim3.exp(np.r_[0.5, -1.0, 2.0, 5.0, -3.0, 1.0, np.log(0.6)])  # a frame and a unit of its own
-    source = of_poses([(G @ T).rigid_pose() for T in poses[RUN]])
+    moved = [(G @ T).rigid_pose() for T in poses[RUN]]
+    source = Reconstruction.of_views(np.array([T.R for T in moved]), np.array([T.t for T in moved]))
     views = {n: replace(k, id=n, metric_scale=False) for n, k in enumerate(keyframes[RUN])}
     found = {n: a for n, k in views.items() if isinstance(a := find_anywhere(k, index, config), Anchor)}
     out = dict(list(found.items())[::HELD_OUT])

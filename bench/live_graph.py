@@ -99,7 +99,10 @@ class Ends:
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=1000, durability=durability, reliability=reliability)
-        note = lambda data: found.append((time.perf_counter(), data))  # noqa: E731
+
+        def note(data: bytes) -> None:
+            found.append((time.perf_counter(), data))
+
         self.node.create_subscription(ros_types(kind), topic, note, qos, raw=True)
 
     def sender(self, topic: str, kind: str, reliable: bool = True, depth: int = 50) -> Any:

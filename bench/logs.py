@@ -200,18 +200,7 @@ def replay(case: Case) -> None:
         run_of = driving(built, 0, noise, metric=False, features=FEATURES, period_ns=period_ns)
         real_data.write_keyframes(folder / "run.mcap", run_of)
         real_data.write_poses(folder / "run.tum", run_of, built.driven)
-        words = [
-            sys.executable,
-            "-m",
-            "xalign_ros",
-            "replay",
-            "run.mcap",
-            "--map",
-            "m.xmap",
-            "--truth",
-            "run.tum",
-            "--json",
-        ]
+        words = [sys.executable, *"-m xalign_ros replay run.mcap --map m.xmap --truth run.tum --json".split()]
         start = time.perf_counter()
         result = json.loads(subprocess.run(words, cwd=folder, check=True, capture_output=True, text=True).stdout)
         wall_s = time.perf_counter() - start

@@ -23,6 +23,15 @@ from xalign_ros.io.xmap import write_map
 
 pytest.importorskip("distributed", reason="Dask is not installed")
 
+INTERRUPTED = """
+import os, signal, sys
+from xalign_ros.apps import batch
+from xalign_ros.apps.main import main
+batch._in_words = lambda row, unit: os.kill(os.getpid(), signal.SIGINT)
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
+"""
+
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
@@ -222,19 +231,13 @@ def test_a_job_that_kills_every_worker_is_a_row_and_the_others_are_done():
 
 
 def test_the_command_stopped_in_the_middle_goes_on_where_it_was(logs, tmp_path, capsys):
-    """A real process, killed once the first log is finished; the second run does only the others."""
-    words = [sys.executable, "-m", "xalign_ros", "batch", *(logs / f"run{n}.mcap" for n in range(3))]
+    """A real process, interrupted at the row of the first log; the second run does only the others.
+
+    By itself, since to signal it from here is a race against the other logs.
+    """
+    words = [sys.executable, "-c", INTERRUPTED, "batch", *(logs / f"run{n}.mcap" for n in range(3))]
     words += ["--map", logs / "line.xmap", "-o", tmp_path, "--workers", "1"]
-    with subprocess.Popen(
-        list(map(str, words)), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
-    ) as process:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.startswith("[1/3]"):
-                process.send_signal(signal.SIGINT)
-                break
-        process.communicate()
-        assert process.returncode == 130
+    assert subprocess.run(list(map(str, words)), capture_output=True, check=False).returncode == 130
     finished = {p.stem for p in tmp_path.glob("run*.json")}
     assert finished and all((tmp_path / f"{name}.tum").exists() for name in finished)
     assert batch(logs, tmp_path, "run0.mcap", "run1.mcap", "run2.mcap", more=["--workers", 1]) == 0

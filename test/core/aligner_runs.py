@@ -17,9 +17,14 @@ WORLDS = {"line": worlds.line, "circle": worlds.circle, "loop": worlds.loop_with
 every_world = pytest.mark.parametrize("name", WORLDS)
 
 
-def replay(map_, keyframes, config=CONFIG):
-    aligner = Aligner(map_, config)
-    return [aligner.step(k) for k in keyframes]
+def replay(map_, keyframes, config=CONFIG, after=None):
+    """The steps; `after` gets the aligner after each."""
+    aligner, steps = Aligner(map_, config), []
+    for keyframe in keyframes:
+        steps.append(aligner.step(keyframe))
+        if after:
+            after(aligner)
+    return steps
 
 
 def position_errors(steps, truth):

@@ -4,27 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import worlds
 
 from xalign_ros.core.aligner import Aligner
-from xalign_ros.core.config import Config
 from xalign_ros.core.faults import FAULTS, faulty
 from xalign_ros.core.lie import so3_log
-from xalign_ros.core.map_building import build_map
 from xalign_ros.core.records import State
-from xalign_ros.core.simulation import driving, mapping, world
-
-
-@pytest.fixture(scope="module")
-def simulated():
-    built = world("corridor", 0, 60)
-    map_ = build_map(mapping(built, 0), built.mapped, map_id="m", source="s", metric=True)
-    run = driving(built, 0, Config().odometry, metric=False)
-    return map_, run, {k.id: T for k, T in zip(run, built.driven, strict=True)}
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_no_wrong_pose_is_localized_and_the_run_ends_localized(name, simulated) -> None:
-    map_, run, truth = simulated
+def test_no_wrong_pose_is_localized_and_the_run_ends_localized(name) -> None:
+    map_, run, truth = worlds.simulated("corridor", 0)
     aligner, errors = Aligner(map_), []
     for _, keyframe in faulty(run, name, 0):
         step = aligner.step(keyframe)
@@ -39,15 +29,13 @@ def test_no_wrong_pose_is_localized_and_the_run_ends_localized(name, simulated) 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_odometry_that_claims_metres_is_overruled_where_its_scale_breaks(seed) -> None:
     """Six anchors agree on another scale; until then the state says that nothing confirms the pose."""
-    built = world("corridor", seed, 60)
-    map_ = build_map(mapping(built, seed), built.mapped, map_id="m", source="s", metric=True)
+    map_, run, truth = worlds.simulated("corridor", seed, metric=True)
     aligner, states, errors = Aligner(map_), [], []
-    run = driving(built, seed, Config().odometry, metric=True)
     for _, keyframe in faulty(run, "scale_step", seed):
         step = aligner.step(keyframe)
         states.append(step.state)
         T = step.correction.T_map_cam if step.correction is not None else None
-        errors.append(np.nan if T is None else np.linalg.norm(T.t - built.driven[keyframe.id].t))
+        errors.append(np.nan if T is None else np.linalg.norm(T.t - truth[keyframe.id].t))
     wrong = [s for s, error in zip(states, errors, strict=True) if error > 0.5]
     assert 0 < len(wrong) < 10 and {s.state for s in wrong} == {State.COASTING}
     assert "contradict the odometry" in wrong[0].reason
@@ -55,8 +43,8 @@ def test_an_odometry_that_claims_metres_is_overruled_where_its_scale_breaks(seed
     assert states[-1].S_map_odom.s == pytest.approx(1 / 1.5, rel=0.05)
 
 
-def test_the_same_seed_breaks_the_same_and_the_run_stays_as_it_was(simulated) -> None:
-    _, run, _ = simulated
+def test_the_same_seed_breaks_the_same_and_the_run_stays_as_it_was() -> None:
+    _, run, _ = worlds.simulated("corridor", 0)
     for name in FAULTS:
         one, two = ([(ns, k.id, k.stamp_ns, k.session) for ns, k in faulty(run, name, 3)] for _ in range(2))
         assert one == two

@@ -49,17 +49,8 @@ def bent_run(seed, views=200, drift=0.4, every=20, wrong=0.2):
         if row in bad:
             T = SE3(so3_exp(rng.normal(size=3)), t[rng.integers(views)] + rng.normal(0, 2, 3))
         anchors[row] = Anchor(row, 0, row, T, COV, 100, 60, 1.0)
-    nothing = (
-        np.zeros(0, int),
-        np.zeros((0, 3)),
-        np.zeros(0, bool),
-        np.zeros(1, int),
-        np.zeros(0, int),
-        np.zeros((0, 2)),
-    )
-    names = tuple(map(str, range(views)))
     R, p = np.array([T.R for T in run]), np.array([T.t for T in run])
-    return Reconstruction(np.arange(views), names, R, p, np.ones(views, bool), *nothing), anchors, t, bad
+    return Reconstruction.of_views(R, p), anchors, t, bad
 
 
 @pytest.mark.parametrize("seed", range(3))

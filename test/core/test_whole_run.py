@@ -10,9 +10,7 @@ from aligner_runs import position_errors, replay
 from xalign_ros.core import whole_run
 from xalign_ros.core.config import Config, Status
 from xalign_ros.core.faults import FAULTS, faulty
-from xalign_ros.core.map_building import build_map
 from xalign_ros.core.records import Rejection
-from xalign_ros.core.simulation import driving, mapping, world
 from xalign_ros.core.whole_run import smooth
 
 
@@ -53,17 +51,9 @@ def test_it_is_as_good_as_the_map_where_there_is_one_and_beats_the_causal_run_wh
     assert 3 < np.mean(nees) < 10  # 6 would be ideal
 
 
-@pytest.fixture(scope="module")
-def simulated():
-    built = world("street", 1, 60)
-    map_ = build_map(mapping(built, 0), built.mapped, map_id="m", source="s", metric=True)
-    run = driving(built, 1, Config().odometry, metric=False)
-    return map_, run, {k.id: T for k, T in zip(run, built.driven, strict=True)}
-
-
 @pytest.mark.parametrize("fault", FAULTS)
-def test_whatever_breaks_the_poses_stay_right(fault, simulated):
-    map_, run, by_id = simulated
+def test_whatever_breaks_the_poses_stay_right(fault):
+    map_, run, by_id = worlds.simulated("street", 1)
     came = [k for _, k in faulty(run, fault, 1)]
     truth = {}
     for k in came:

@@ -18,7 +18,7 @@ from xalign_ros.core.lie import so3_exp
 from xalign_ros.core.map_building import build_map
 from xalign_ros.core.records import NO_TRACK, Features, Keyframe
 from xalign_ros.core.reference_map import ReferenceMap
-from xalign_ros.core.simulation import camera_at, drifting
+from xalign_ros.core.simulation import camera_at, drifting, driving, mapping, world
 from xalign_ros.core.transforms import SE3, Sim3
 
 CAMERA = Camera("radtan", [420.0, 420.0, 319.5, 239.5], [-0.05, 0.01, 0.0005, -0.0005], 640, 480)
@@ -53,6 +53,14 @@ class Run:
 
     def __len__(self) -> int:
         return len(self.keyframes)
+
+
+@functools.cache
+def simulated(name: str, seed: int, metric: bool = False) -> tuple[ReferenceMap, list[Keyframe], tuple[SE3, ...]]:
+    """Sixty keyframes in a world of core/simulation.py: map, run, and its truth by keyframe id."""
+    built = world(name, seed, 60)
+    map_ = build_map(mapping(built, seed), built.mapped, map_id=name, source="simulated", metric=True)
+    return map_, driving(built, seed, Odometry(), metric=metric), built.driven
 
 
 # Paths: T_map_cam with the camera level, looking along the heading turned by `aside`. -------------------------------

@@ -84,7 +84,7 @@ class Alignment:
 
     def restart(self, reason: str) -> Answer:
         """With nothing known but the map."""
-        self._aligner = Aligner(self.map, self._terms.config, window_poses=False)
+        self._aligner = Aligner(self.map, self._terms.config)
         self._carrier: Carrier | None = None
         self._path: deque[tuple[int, SE3]] = deque()
         self._accepted: deque[tuple[Anchor, SE3]] = deque(maxlen=SHOWN_ANCHORS)
@@ -186,7 +186,7 @@ class Alignment:
         if "path" in views:
             shown["path"] = path_message(ros_types, self._path, self.map_frame)
         if "markers" in views:
-            window = [T for _, T in self._aligner.belief.poses()]
+            window = [T for _, T in self._aligner.poses()]
             shown["markers"] = markers_message(
                 ros_types, step.stamp_ns, list(self._accepted), list(self._rejected), window, self.map_frame
             )

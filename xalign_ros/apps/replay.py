@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> None:
     source, chosen = read_source(args), Chosen(args.keyframe_topic, args.image_topic)
     map_ = read_map(args.map, verify=True)
     truth = read_truth(args.truth)
-    aligner, record, types = Aligner(map_, config, window_poses=False), Run(), typestore().types.__getitem__
+    aligner, record, types = Aligner(map_, config), Run(), typestore().types.__getitem__
     with ExitStack() as stack:
         log = stack.enter_context(Log(args.log))
         keyframes = log_keyframes(log, source, config.selection, map_, chosen)

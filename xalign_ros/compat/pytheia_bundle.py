@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -94,7 +94,7 @@ def _adjusted(
     *,
     edges: Sequence[RelativePoseConstraint] = (),
     variable_views: set[int] | None = None,
-    constant_tracks: set[int] = frozenset(),  # type: ignore[assignment]
+    constant_tracks: Collection[int] = (),
 ) -> BundleAdjustmentSummary:
     begin = time.perf_counter()
     view_ids, track_ids = reconstruction.ViewIds(), reconstruction.TrackIds()

@@ -32,16 +32,12 @@ TOGETHER = 5  # keyframes that are looked for at once
 
 
 class Aligner:
-    """One map, one odometry; `step` once per keyframe, in order of arrival.
+    """One map, one odometry; `step` once per keyframe, in order of arrival."""
 
-    Without window_poses, which cost as much as the window's update, Step.poses stays empty and all else is the same.
-    """
-
-    def __init__(self, map_: ReferenceMap, config: Config | None = None, window_poses: bool = True) -> None:
+    def __init__(self, map_: ReferenceMap, config: Config | None = None) -> None:
         self.config = config or Config()
         self.index = MapIndex(map_)
         self.belief = Belief(self.config)
-        self._window_poses = window_poses
         self._published: Sim3 | None = None  # the last S_map_odom, for a jump to start from
         self._sightings: deque[Sighting] = deque(maxlen=TOGETHER)  # of the newest keyframes, while there is no lock
         self._hint: Hint | None = None  # given since the last keyframe
@@ -82,6 +78,13 @@ class Aligner:
         if self.belief.estimate is not None:
             self._prior = None
         return self._step(found, predicted, self._correction(keyframe), believed)
+
+    def poses(self) -> tuple[tuple[int, SE3], ...]:
+        """T_map_cam of the window's keyframes by id, as the last step left them, newest last; none without a lock.
+
+        Not part of the Step: to take them out of the window costs as much as to update it.
+        """
+        return self.belief.poses()
 
     def _begin(self, state: State, reason: str) -> list[Keyframe]:
         """Anew, with no keyframe."""
@@ -171,7 +174,6 @@ class Aligner:
             rejection,
             believed,
             predicted[0].rigid_pose() if predicted else None,
-            self.belief.poses() if self._window_poses else (),
         )
 
     def _state(self, session: int, stamp_ns: int) -> AlignmentState:

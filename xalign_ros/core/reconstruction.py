@@ -125,6 +125,13 @@ class Reconstruction:
         self._rows("priors.views", None if self.priors is None else self.priors.views, v)
         self._rows("gravity.views", None if self.gravity is None else self.gravity.views, v)
 
+    @staticmethod
+    def of_views(R: Array, t: Array) -> Reconstruction:
+        """Poses (V, 3, 3), (V, 3) alone, with rows for ids and names."""
+        rows, none = np.arange(len(R)), np.zeros(0, int)
+        nothing = (none, np.zeros((0, 3)), none.astype(bool), np.zeros(1, int), none, np.zeros((0, 2)))
+        return Reconstruction(rows, tuple(map(str, rows)), R, t, np.ones(len(R), bool), *nothing)
+
     def _rows(self, name: str, rows: np.ndarray | None, count: int, least: int = 0) -> None:
         if rows is not None and len(rows) and not (rows.min() >= least and rows.max() < count):
             bad = rows[(rows < least) | (rows >= count)][0]

@@ -232,8 +232,7 @@ class AlignmentState:
 class Step:
     """All that one keyframe brought about.
 
-    believed are the anchors of earlier keyframes that waited until this one's lock; poses are the window's (key =
-    keyframe id), newest last.
+    believed are the anchors of earlier keyframes that waited until this one's lock.
     """
 
     keyframe_id: int
@@ -245,4 +244,3 @@ class Step:
     rejection: Rejection | None = None
     believed: tuple[Anchor, ...] = ()
     T_map_cam_predicted: SE3 | None = None
-    poses: tuple[tuple[int, SE3], ...] = ()

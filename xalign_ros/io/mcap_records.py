@@ -9,7 +9,7 @@ from typing import Any
 from zlib import crc32
 
 import zstandard
-from lz4.frame import decompress as lz4_decompress  # type: ignore[import-untyped]
+from lz4.frame import decompress as lz4_decompress
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
