@@ -156,7 +156,7 @@ def flat(case: Case, mb: list[float], step_s: list[float], what: str) -> None:
 def soak(case: Case) -> None:
     map_, drive, _ = simulated()
     aligner, mb, step_s, lost = Aligner(map_), list[float](), list[float](), 0
-    for n, keyframe in enumerate(islice(there_and_back([with_few_features(k) for k in drive], KEYFRAME_HZ), SOAK)):
+    for n, keyframe in enumerate(islice(_few(drive), SOAK)):
         start = time.perf_counter()
         lost += aligner.step(keyframe).state.state is State.LOST
         if n % 100 == 0:
