@@ -29,6 +29,7 @@ from xalign_ros.apps import batch
 from xalign_ros.apps.main import main
 batch._in_words = lambda row, unit: os.kill(os.getpid(), signal.SIGINT)
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     sys.exit(main(sys.argv[1:]))
 """
 
