@@ -5,24 +5,34 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not compiled")
 
+from functools import partial
+
 import live
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 
 from xalign_ros.apps.node_inputs import Inputs
+from xalign_ros.apps.node_source import NodeSource
+from xalign_ros.core.config import Selection
+from xalign_ros.io import adapter
+from xalign_ros.io.adapter import SourceOptions
 from xalign_ros.io.frame_messages import TF, StaticTree
 from xalign_ros.io.odometry_message import ODOMETRY, odometry_pose
 from xalign_ros.io.ros_fields import ros_types
 
 POSED = "geometry_msgs/msg/PoseWithCovarianceStamped"
 KINDS = {
-    "odometry": (ODOMETRY, odometry_pose),
-    "/tf_static": (TF, StaticTree().hear),
-    "initialpose": (POSED, odometry_pose),
+    "odometry": (ODOMETRY, odometry_pose, False),
+    "/tf_static": (TF, StaticTree().hear, False),
+    "initialpose": (POSED, odometry_pose, False),
 }
 MOST = 4096
+for source in adapter.KINDS:
+    fed = NodeSource(SourceOptions(source), Selection(), lambda frame: None, lambda *refused: None)
+    for role, (_, kind) in (adapter.KINDS[source] | adapter.IMAGES | adapter.STATIC).items():
+        KINDS[f"{source}/{role}"] = kind, partial(fed.take, role), role in adapter.IMAGES
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +40,13 @@ def arrivals():
     """Per topic, what the executor would call with the bytes that came."""
     with live.observer() as me:
         inputs = Inputs(me.node)
-        for topic, (kind, take) in KINDS.items():
-            inputs.subscribe(topic, kind, QoSProfile(depth=1), MOST, take)
+        for topic, (kind, take, raw) in KINDS.items():
+            inputs.subscribe(topic, kind, QoSProfile(depth=1), MOST, take, raw)
         yield inputs, {s.topic_name.strip("/"): s.callback for s in inputs._subscriptions}
         inputs.close()
 
 
+@settings(max_examples=300)
 @given(
     topic=st.sampled_from(sorted(KINDS)),
     junk=st.binary(max_size=64),
