@@ -54,7 +54,7 @@ demo: $(STAMP)
 	$(VENV)/bin/xalign demo -o demo_report
 
 test: $(STAMP)
-	$(PY) -m pytest -q test
+	$(PY) -m pytest -q -n 2 --dist loadfile test
 
 check: $(STAMP)
 	$(VENV)/bin/ruff format --check .

@@ -67,6 +67,7 @@ setup(
         # Exact where another version formats or complains differently. The name `test` makes colcon test use pytest.
         "test": [
             "pytest>=8.3,<10",
+            "pytest-xdist>=3.6,<4",  # tests of nodes wait most of their time
             "hypothesis>=6.100,<7",
             "pycolmap==4.2.1",
             "ruff==0.17.6",

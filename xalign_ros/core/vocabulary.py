@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.cluster.vq import vq
 
 from xalign_ros.core.descriptors import columns, differing_bits, pair_distance, unit
 from xalign_ros.core.lie import Array
@@ -54,10 +53,10 @@ class Vocabulary:
         for start in range(0, len(word), BLOCK):
             part = slice(start, start + BLOCK)
             x = _vectors(descriptors[part], norm)
-            top = vq(x, coarse, check_finite=False)[0]
+            top = _nearest(x, coarse)
             for c in np.unique(top):
                 own = np.flatnonzero(top == c)
-                word[start + own] = c * size + vq(x[own], fine[c], check_finite=False)[0]
+                word[start + own] = c * size + _nearest(x[own], fine[c])
         order = np.argsort(word, kind="stable")
         offset = np.searchsorted(word[order], np.arange(size * size + 1))
         return Vocabulary(coarse, fine, offset, order.astype(np.int32), columns(_codes(descriptors[order], norm)))
@@ -142,11 +141,17 @@ def _means(x: Array, count: int) -> tuple[Array, np.ndarray]:
     rng = np.random.default_rng(0)
     means: Array = x[rng.choice(len(x), count, replace=False)]
     for _ in range(SWEEPS):
-        home = vq(x, means, check_finite=False)[0]
+        home = _nearest(x, means)
         order = np.argsort(home, kind="stable")
         own, first = np.unique(home[order], return_index=True)  # a mean that nothing is nearest to stays where it is
         means[own] = np.add.reduceat(x[order], first, axis=0) / np.diff(np.r_[first, len(x)])[:, None]
-    return means, vq(x, means, check_finite=False)[0]
+    return means, _nearest(x, means)
+
+
+def _nearest(x: Array, means: Array) -> np.ndarray:
+    from scipy.cluster.vq import vq  # takes half a second to import, and a node never learns
+
+    return np.asarray(vq(x, means, check_finite=False)[0])
 
 
 def _squared(x: Array, means: Array) -> Array:
