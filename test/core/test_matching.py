@@ -102,7 +102,7 @@ def test_the_bands_find_what_looking_at_every_pair_finds(seed, features, points,
     uv, centre = rng.uniform(-5, 645, (features, 2)), rng.uniform(-40, 680, (points, 2))
     L = size * rng.normal(size=(points, 2, 2))
     S = L @ np.swapaxes(L, 1, 2) + np.eye(2)
-    row, at = _inside_ellipses(uv, centre, S, 100.0)
+    row, at = _inside_ellipses(uv, centre, np.array([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]]), 100.0)
     longest = np.linalg.eigvalsh(S)[:, -1]
     inverse = np.linalg.inv(S * np.minimum(ELLIPSE_SIGMAS**2, 100.0**2 / longest)[:, None, None])
     d = uv[:, None] - centre

@@ -11,7 +11,7 @@ import numpy as np
 from xalign_ros.core.config import Config, Pnp
 from xalign_ros.core.lie import Array
 from xalign_ros.core.matching import NO_MATCHES, Matches, guided_matches, place_matches, places
-from xalign_ros.core.pnp import Points2D3D, Pose, estimate_pose, evidence, refine_pose, sample_pose
+from xalign_ros.core.pnp import Points2D3D, Pose, estimate_pose, evidence, refine_pose, sample_pose, upper_median
 from xalign_ros.core.records import Anchor, Keyframe, Rejection
 from xalign_ros.core.reference_map import MapIndex
 from xalign_ros.core.transforms import SE3
@@ -66,7 +66,7 @@ class _Search:
             points,
             T_map_cam,
             cov_cam,
-            float(np.median(self.sigma_px)),
+            upper_median(self.sigma_px),
             self.config.matching,
             most_pairs,
         )

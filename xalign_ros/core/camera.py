@@ -106,18 +106,20 @@ class Camera:
         return uv, valid
 
     def project_with_jacobian(self, xyz_cam: ArrayLike) -> tuple[Array, np.ndarray, Array]:
-        """Pixels (N, 2), validity (N,) and d uv / d xyz_cam (N, 2, 3)."""
+        """Pixels (N, 2), validity (N,) and d uv / d xyz_cam (N, 2, 3); columns are contiguous where those of xyz_cam are."""
         x = np.asarray(xyz_cam, float)
         m, valid, J = self._distort(x, True)
         uv = self.K[:2] * m + self.K[2:]
-        uv[~valid] = np.nan
-        return uv, valid, self.K[:2, None] * J
+        if not valid.all():
+            uv[~valid] = np.nan
+        J *= self.K[:2, None]
+        return uv, valid, J
 
     def inside(self, uv: ArrayLike, border_px: float = 0.0) -> np.ndarray:
         """Whether pixels (N, 2) lie on the image, whose area reaches half a pixel beyond the outer centres."""
-        uv = np.asarray(uv, float)
-        low, high = -0.5 - border_px, np.array([self.width, self.height]) - 0.5 + border_px
-        return np.asarray(((uv >= low) & (uv <= high)).all(axis=-1))
+        low, high = -0.5 - border_px, border_px - 0.5
+        u, v = np.moveaxis(np.asarray(uv, float), -1, 0)
+        return np.asarray((u >= low) & (u <= self.width + high) & (v >= low) & (v <= self.height + high))
 
     def unproject(self, uv: ArrayLike) -> tuple[Array, np.ndarray]:
         """Unit bearings (N, 3) in the camera frame and validity (N,) of pixels (N, 2); invalid rows are NaN."""
@@ -184,18 +186,19 @@ def _opencv(d: tuple[float, ...]) -> PlaneDistortion | None:
 
 def _distort_pinhole(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:
     z = x[:, 2]
-    a = x[:, :2] / z[:, None]
-    valid = (z > 1e-9) & (np.einsum("ij,ij->i", a, a) <= camera.limit**2)
+    near = 1 / z
+    a = x[:, :2] * near[:, None]
+    valid = (z > 1e-9) & (a[:, 0] * a[:, 0] + a[:, 1] * a[:, 1] <= camera.limit**2)
     m, Ja = (a, NO_JACOBIAN) if camera.plane is None else camera.plane.distort(a, jacobian)
     if not jacobian:
         return m, valid, NO_JACOBIAN
-    J = np.zeros((len(x), 2, 3))
+    J = np.zeros((len(x), 2, 3), order="F")
     if camera.plane is None:
-        J[:, 0, 0] = J[:, 1, 1] = 1 / z
-        J[:, :, 2] = -a / z[:, None]
+        J[:, 0, 0] = J[:, 1, 1] = near
+        J[:, :, 2] = -a * near[:, None]
     else:
-        J[:, :, :2] = Ja / z[:, None, None]
-        J[:, :, 2] = -np.einsum("nij,nj->ni", Ja, a) / z[:, None]
+        J[:, :, :2] = Ja * near[:, None, None]
+        J[:, :, 2] = -J[:, :, 0] * a[:, :1] - J[:, :, 1] * a[:, 1:]
     return m, valid, J
 
 
@@ -211,8 +214,10 @@ def _distort_radial(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np
     if not jacobian:
         return m, valid, NO_JACOBIAN
     e = np.where(on_axis[:, None], 0.0, x[:, :2] / safe[:, None])
-    J = np.empty((len(x), 2, 3))
-    J[:, :, :2] = k[:, None, None] * np.eye(2) + ((dq_dr - k)[:, None] * e)[:, :, None] * e[:, None, :]
+    J = np.empty((len(x), 2, 3), order="F")
+    J[:, :, :2] = ((dq_dr - k)[:, None] * e)[:, :, None] * e[:, None, :]
+    J[:, 0, 0] += k
+    J[:, 1, 1] += k
     J[:, :, 2] = dq_dz[:, None] * e
     return m, valid, J
 
@@ -224,7 +229,7 @@ def _longitude_latitude(x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Ar
     valid = (h > 1e-9 * np.abs(x[:, 1])) & (h > 1e-9)
     if not jacobian:
         return m, valid, NO_JACOBIAN
-    J, n2 = np.zeros((len(x), 2, 3)), h * h + x[:, 1] ** 2
+    J, n2 = np.zeros((len(x), 2, 3), order="F"), h * h + x[:, 1] ** 2
     J[:, 0, 0], J[:, 0, 2] = x[:, 2] / h**2, -x[:, 0] / h**2
     J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = -x[:, 0] * x[:, 1] / (h * n2), h / n2, -x[:, 2] * x[:, 1] / (h * n2)
     return m, valid, J

@@ -47,19 +47,22 @@ class PlaneDistortion:
         (p1, p2), (s1, s2, s3, s4) = self.p, self.s
         r2 = x * x + y * y
         g, dg = _ratio(self.top, self.low, r2)
-        fx = x * g + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        fy = y * g + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        fx, fy = x * g, y * g
+        if p1 or p2:
+            fx += 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            fy += p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         prism = any(self.s)
         if prism:
             fx += r2 * (s1 + s2 * r2)
             fy += r2 * (s3 + s4 * r2)
-        f = np.stack([fx, fy], 1)
+        f = np.array([fx, fy]).T
         if not jacobian:
             return f, NO_JACOBIAN
-        J = np.empty((len(a), 2, 2))
-        J[:, 0, 0] = g + 2 * x * x * dg + 2 * p1 * y + 6 * p2 * x
-        J[:, 0, 1] = J[:, 1, 0] = 2 * x * y * dg + 2 * p1 * x + 2 * p2 * y
-        J[:, 1, 1] = g + 2 * y * y * dg + 6 * p1 * y + 2 * p2 * x
+        J = np.empty((len(a), 2, 2), order="F")
+        xp, yp, bend = 2 * p2 * x, 2 * p1 * y, 2 * dg
+        J[:, 0, 0] = g + bend * x * x + yp + 3 * xp
+        J[:, 0, 1] = J[:, 1, 0] = bend * x * y + 2 * p1 * x + 2 * p2 * y
+        J[:, 1, 1] = g + bend * y * y + 3 * yp + xp
         if prism:
             slope = 2 * np.array([s1, s3]) + 4 * np.array([s2, s4]) * r2[:, None]
             J += slope[:, :, None] * a[:, None, :]

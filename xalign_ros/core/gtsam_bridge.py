@@ -38,7 +38,7 @@ def edge_factor(edge: RelativePose, i: int, j: int) -> gtsam.NonlinearFactor:
 
 def anchor_factor(anchor: Anchor, key: int, scale: float, huber: float) -> gtsam.NonlinearFactor:
     """Log(Z^-1 S) of an anchor whose scale is free; `scale` (m per odometry unit) turns its metres into S's units."""
-    D = np.r_[1.0, 1.0, 1.0, 1 / scale, 1 / scale, 1 / scale]
+    D = np.array((1.0, 1.0, 1.0, 1 / scale, 1 / scale, 1 / scale))
     cov = np.zeros((7, 7))
     cov[:6, :6] = D[:, None] * anchor.cov_cam * D
     cov[6, 6] = FREE_LOG_SCALE**2

@@ -43,8 +43,9 @@ def _fault(k: Keyframe, earlier: Sequence[Keyframe], map_: ReferenceMap) -> tupl
         return "no_intrinsics", "its camera has no intrinsics"
     if not len(f):
         return "no_features", "it carries no features"
-    if not np.isfinite(f.uv).all() or not k.camera.inside(f.uv, BORDER_PX).all():
-        worst = f.uv[~(np.isfinite(f.uv).all(axis=1) & k.camera.inside(f.uv, BORDER_PX))][0]
+    inside = k.camera.inside(f.uv, BORDER_PX)  # not for NaN
+    if not inside.all():
+        worst = f.uv[~inside][0]
         return "bad_pixel", f"feature at {worst.tolist()} px is outside its {k.camera.width} x {k.camera.height} image"
     if f.sigma_px is not None and not (np.isfinite(f.sigma_px).all() and (f.sigma_px > 0).all()):
         return "bad_pixel", "a feature's sigma_px is not a positive number"

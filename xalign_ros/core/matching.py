@@ -9,14 +9,14 @@ import numpy as np
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.config import Matching
 from xalign_ros.core.descriptors import indexed_distance, nearest
-from xalign_ros.core.lie import Array, hat
+from xalign_ros.core.lie import Array, turn_and_shift
 from xalign_ros.core.records import Features
 from xalign_ros.core.reference_map import MapIndex, ReferenceMap
 from xalign_ros.core.transforms import SE3
 
 ELLIPSE_SIGMAS = 3.0  # that a prediction is searched within
-SAMPLED = 50  # points that tell how large the ellipses are
-LEAST_BAND_PX = 40.0  # more bands cost more than they save
+LEAST_BAND_PX = 20.0  # more bands cost more than they save
+AT_ONCE = 1 << 15  # pairs looked at: they stay in the processor's cache
 SAME_POINT_RATIO = 0.01  # points closer than this part of their distance to the camera are one point seen twice
 
 
@@ -51,18 +51,19 @@ def guided_matches(
     One to one, with a ratio test against the best pair with a different point. Where more than most_pairs of a feature and
     a point are to be expected, only every n-th point is looked for. Returns whether all were.
     """
-    x_cam = (map_.points[points] - T_map_cam.t) @ T_map_cam.R
+    x_cam = (T_map_cam.R.T @ (map_.points[points] - T_map_cam.t).T).T
     uv, valid, J = camera.project_with_jacobian(x_cam)
     seen = np.flatnonzero(valid & camera.inside(uv, config.guided_radius_px))
     if not len(seen) or not len(features):
         return NO_MATCHES, True
-    image = camera.width * camera.height
-    some = seen[:: max(1, len(seen) // SAMPLED)]
-    area = np.pi * np.sqrt(np.linalg.det(_spread(x_cam[some], J[some], cov_cam, sigma_px, config))).mean()
-    step = max(1, int(np.ceil(len(seen) * len(features) * ELLIPSE_SIGMAS**2 * area / image / most_pairs)))
-    seen = seen[::step]
-    points, uv, S = points[seen], uv[seen], _spread(x_cam[seen], J[seen], cov_cam, sigma_px, config)
-    feature, at = _inside_ellipses(features.uv, uv, S, max(config.guided_radius_max_px, camera.width / 10))
+    least = max(2 * sigma_px**2, (config.guided_radius_px / ELLIPSE_SIGMAS) ** 2)
+    S = _spread(x_cam[seen], J[seen], cov_cam, least)
+    area = ELLIPSE_SIGMAS**2 * np.pi * np.sqrt(S[0] * S[2] - S[1] ** 2).mean()
+    pairs = len(seen) * len(features) * area / (camera.width * camera.height)
+    step = max(1, int(np.ceil(pairs / most_pairs)))
+    seen, S = seen[::step], S[:, ::step]
+    feature, at = _inside_ellipses(features.uv, uv[seen], S, max(config.guided_radius_max_px, camera.width / 10))
+    points = points[seen]
     distance = indexed_distance(features.descriptors, map_.descriptors[points], feature, at, map_.norm)
     matches = _one_to_one(
         feature, points[at], distance, config.guided_ratio, map_.points, T_map_cam.t, map_.descriptor_gate
@@ -70,52 +71,56 @@ def guided_matches(
     return matches, step == 1
 
 
-def _spread(x_cam: Array, J: Array, cov_cam: Array, sigma_px: float, config: Matching) -> Array:
-    """Covariance (N, 2, 2) px of where points (N, 3) of the camera's frame are seen, J (N, 2, 3) that of the projection."""
-    J_pose = np.concatenate([J @ hat(x_cam), -J], axis=2)
-    least = max(2 * sigma_px**2, (config.guided_radius_px / ELLIPSE_SIGMAS) ** 2)
-    S: Array = np.einsum("nij,nkj->nik", (J_pose.reshape(-1, 6) @ cov_cam).reshape(-1, 2, 6), J_pose)
-    return S + least * np.eye(2)
+def _spread(x_cam: Array, J: Array, cov_cam: Array, least: float) -> Array:
+    """Variance of u, covariance, variance of v (3, N) px^2 of where points (N, 3) of the camera's frame are seen.
+
+    J (N, 2, 3) is that of the projection; the variances are `least` higher than what the pose's covariance leaves.
+    """
+    A = turn_and_shift(J, x_cam)
+    B = (cov_cam @ A.reshape(6, -1)).reshape(A.shape)
+    u, v = (A * B).sum(axis=0) + least
+    return np.array([u, (A[:, 0] * B[:, 1]).sum(axis=0), v])
 
 
 def _inside_ellipses(uv: Array, centre: Array, S: Array, most_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (row of uv (N, 2), row of centre (M, 2)) where uv is in the centre's ellipse of ELLIPSE_SIGMAS of S (M, 2, 2).
+    """Pairs (row of uv (N, 2), row of centre (M, 2)) where uv is in the centre's ellipse of ELLIPSE_SIGMAS of S (3, M).
 
-    Ellipses longer than most_px are shrunk to it. Rows of uv are looked up by bands of the image, in each by order of x.
+    Ellipses longer than most_px are shrunk to it. Rows of uv are looked up by bands of the image, in each by order of u.
     """
-    largest = (S[:, 0, 0] + S[:, 1, 1]) / 2 + np.hypot((S[:, 0, 0] - S[:, 1, 1]) / 2, S[:, 0, 1])
-    S = S * np.minimum(ELLIPSE_SIGMAS**2, most_px**2 / largest)[:, None, None]
-    a, b, c = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
-    half_u, half_v, determinant = np.sqrt(a), np.sqrt(c), a * c - b * b
-    # (c du^2 - 2 b du dv + a dv^2) / determinant <= 1
-    weights = np.stack([c, -2 * b, a]) / determinant
-    height = max(float(np.median(half_v)), LEAST_BAND_PX)
-    band = np.floor(uv[:, 1] / height).astype(np.int64)
-    order = np.lexsort((uv[:, 0], band))
-    (u, v), (u_0, v_0) = uv[order].T, centre.T
-    left, right = u_0 - half_u, u_0 + half_u
-    low, high = v_0 - half_v, v_0 + half_v
-    begin = np.searchsorted(band[order], np.arange(band[order[0]], band[order[-1]] + 2))
-    rows, centres = [], []
-    for n, edge in enumerate(height * np.arange(band[order[0]], band[order[-1]] + 1)):
-        own = slice(begin[n], begin[n + 1])
-        near = np.flatnonzero((high >= edge) & (low <= edge + height))
-        first = begin[n] + np.searchsorted(u[own], left[near])
-        counts = begin[n] + np.searchsorted(u[own], right[near]) - first
-        row = np.repeat(first - np.cumsum(counts) + counts, counts)
-        row += np.arange(len(row))
-        at = np.repeat(near, counts)
+    a, b, c = S
+    largest = (a + c) / 2 + np.hypot((a - c) / 2, b)
+    a, b, c = S * np.minimum(ELLIPSE_SIGMAS**2, most_px**2 / largest)
+    # (c du^2 - 2 b du dv + a dv^2) / (a c - b^2) <= 1
+    weights, half_u, half_v = np.array([c, -2 * b, a]) / (a * c - b * b), np.sqrt(a), np.sqrt(c)
+    height = max(float(np.partition(half_v, len(half_v) // 2)[len(half_v) // 2]), LEAST_BAND_PX)
+    band = np.floor(uv[:, 1] / height)
+    wide = 2 * float(np.abs(uv[:, 0]).max()) + 1  # a band's range of keys, u in the middle of it
+    key = band * wide + uv[:, 0]
+    order = np.argsort(key, kind="stable")
+    key, (u, v), (u_0, v_0) = key[order], uv[order].T, centre.T
+    low = np.maximum(np.floor((v_0 - half_v) / height), band.min())
+    high = np.minimum(np.floor((v_0 + half_v) / height), band.max())
+    bands = np.maximum(high - low + 1, 0).astype(np.int64)
+    centres = np.repeat(np.arange(len(centre)), bands)
+    edge = _counted(bands, low.astype(np.int64)) * wide
+    left, right = np.clip([u_0 - half_u, u_0 + half_u], -wide / 2, wide / 2)[:, centres]
+    first = np.searchsorted(key, edge + left)
+    counts = np.searchsorted(key, edge + right, side="right") - first
+    rows, found = [], []
+    for part in np.array_split(np.arange(len(counts)), 1 + int(counts.sum()) // AT_ONCE):
+        at, row = np.repeat(centres[part], counts[part]), _counted(counts[part], first[part])
         du, dv = u[row] - u_0[at], v[row] - v_0[at]
-        q = weights[0, at] * du
-        q += weights[1, at] * dv
-        q *= du
-        dv *= dv
-        dv *= weights[2, at]
-        q += dv
-        inside = np.flatnonzero(q <= 1)
+        w = weights[:, at]
+        inside = np.flatnonzero((w[0] * du + w[1] * dv) * du + w[2] * dv * dv <= 1)
         rows.append(order[row[inside]])
-        centres.append(at[inside])
-    return np.concatenate(rows), np.concatenate(centres)
+        found.append(at[inside])
+    return np.concatenate(rows), np.concatenate(found)
+
+
+def _counted(counts: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """first[n], first[n] + 1, ..., counts[n] of them, for each n."""
+    end = np.cumsum(counts)
+    return np.repeat(first - end + counts, counts) + np.arange(end[-1] if len(end) else 0)
 
 
 def place_matches(features: Features, index: MapIndex, keyframes: np.ndarray, config: Matching) -> Matches:
@@ -164,17 +169,22 @@ def _one_to_one(
     feature, point, distance = feature[some], point[some], distance[some]
     order = np.lexsort((point, distance, feature))
     f, p, d = feature[order], point[order], distance[order]
-    first = np.flatnonzero(np.r_[True, np.diff(f) > 0])
-    sizes = np.diff(np.r_[first, len(f)])
-    best = np.repeat(first, sizes)
-    apart = np.linalg.norm(xyz[p] - xyz[p[best]], axis=1) > SAME_POINT_RATIO * np.linalg.norm(
-        xyz[p[best]] - eye, axis=1
-    )
+    first = _starts(f)
+    best = np.repeat(first, np.diff(first, append=len(f)))
+    at, at_best = xyz[p].T, xyz[p[best]].T
+    off, ray = at - at_best, at_best - eye[:, None]
+    apart = (off * off).sum(axis=0) > SAME_POINT_RATIO**2 * (ray * ray).sum(axis=0)
     runner_up = np.minimum.reduceat(np.where(apart, d, np.inf), first)
     keep = first[(d[first] < ratio * runner_up) & (d[first] <= gate)]  # a tie at distance 0 is a tie
     # One to one from the other side: of the features that chose a point, the nearest keeps it.
     order = np.lexsort((f[keep], d[keep], p[keep]))
     keep = keep[order]
-    keep = keep[np.r_[True, np.diff(p[keep]) > 0]] if len(keep) else keep
-    keep = keep[np.argsort(f[keep], kind="stable")]
+    keep = np.sort(keep[_starts(p[keep])])
     return Matches(f[keep], p[keep], d[keep])
+
+
+def _starts(x: np.ndarray) -> np.ndarray:
+    """Where the runs of equal numbers (N,) begin."""
+    if not len(x):
+        return np.zeros(0, np.int64)
+    return np.concatenate([[0], 1 + np.flatnonzero(x[1:] != x[:-1])])

@@ -86,7 +86,7 @@ def predict(solution: Estimate, edge: RelativePose) -> tuple[Sim3, Array]:
 
 def pose_covariance(S: Sim3, cov: Array) -> Array:
     """Covariance (6, 6) of T_map_cam, camera axes, rad and m, of a node S_map_i with covariance (7, 7)."""
-    D = np.r_[1.0, 1.0, 1.0, S.s, S.s, S.s]
+    D = np.array((1.0, 1.0, 1.0, S.s, S.s, S.s))
     return np.asarray(D[:, None] * cov[:6, :6] * D)
 
 

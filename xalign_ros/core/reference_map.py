@@ -172,7 +172,9 @@ class MapIndex:
         distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
         cosine = np.einsum("ij,ij->i", ray, self.visibility.view[points])
         least, most = self.visibility.distances[points].T
-        same = (cosine > LEAST_VIEW_COSINE * distance) & (distance > least / MOST_ZOOM) & (distance < most * MOST_ZOOM)
+        same = cosine > LEAST_VIEW_COSINE * distance
+        same &= MOST_ZOOM * distance > least
+        same &= distance < MOST_ZOOM * most
         return np.asarray(points[same])
 
     def keyframes_near(self, T_map_cam: SE3, count: int) -> np.ndarray:
