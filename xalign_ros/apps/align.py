@@ -31,7 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kinds = "folder of a COLMAP model, or pyTheia's file with descriptors"
     parser.add_argument("run", type=Path, metavar="RUN", help=f"what is brought over: {kinds}")
     parser.add_argument("segment", type=Path, metavar="SEGMENT", help=f"whose frame and scale it gets: {kinds}")
-    told = "the run in the segment's frame, in the format of RUN; its poses go to OUT.tum"
+    told = "the run in the segment's frame, in the format that the name ends in (.ply, .json), else in that of RUN; "
+    told += "its poses go to OUT.tum"
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help=told)
     for name in ("run", "segment"):
         told = f"COLMAP's, of the {name}'s features (default: database.db in or beside the model)"

@@ -22,9 +22,8 @@ WIDTH = 2.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model", type=Path, metavar="MODEL", help="folder of a COLMAP model, or pyTheia's file")
-    parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="OUT", help="adjusted, in the format of MODEL"
-    )
+    told = "adjusted, in the format that the name ends in (.ply, .json), else in that of MODEL"
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help=told)
     parser.add_argument("--force", action="store_true", help="replace an existing output")
     parser.add_argument(
         "--robust",
