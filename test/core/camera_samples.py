@@ -17,6 +17,8 @@ CAMERAS = {
     "fov": Camera("fov", K, [0.9], 640, 480),
     "division": Camera("division", K, [-0.12], 640, 480),
     "division the other way": Camera("division", K, [0.08], 640, 480),
+    "cubic": Camera("cubic", K, [0.15], 640, 480),
+    "cubic the other way": Camera("cubic", K, [-0.1], 640, 480),
     "eucm": Camera("eucm", K, [0.62, 1.08], 640, 480),
     "eucm below a half": Camera("eucm", K, [0.3, 0.9], 640, 480),
     "double_sphere": Camera("double_sphere", K, [-0.18, 0.59], 640, 480),

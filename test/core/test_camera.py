@@ -47,6 +47,14 @@ def test_fov_against_its_formula():
     np.testing.assert_allclose(uv, K[:2] * a * np.arctan(2 * r * np.tan(w / 2)) / w / r + K[2:], atol=1e-9)
 
 
+@pytest.mark.parametrize("k", [0.15, -0.1, 1e-9, 0.0])
+def test_cubic_against_its_formula(k):
+    """Wu: what is measured, times 1 + k r^2 of it, is what a pinhole would see."""
+    x, uv = on_image(Camera("cubic", K, [k], 640, 480))
+    m = (uv - K[2:]) / K[:2]
+    np.testing.assert_allclose(m * (1 + k * (m * m).sum(1, keepdims=True)), x[:, :2] / x[:, 2:], atol=1e-12)
+
+
 @every
 def test_jacobian_against_finite_differences(camera):
     x, _ = on_image(camera, 60)

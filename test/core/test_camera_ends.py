@@ -103,7 +103,7 @@ def test_pixels_that_are_no_numbers_are_invalid():
     [
         (
             {"model": "brown"},
-            "camera model 'brown' is not one of radtan, equidistant, fov, eucm, double_sphere, division, omni",
+            "camera model 'brown' is not one of radtan, equidistant, fov, eucm, double_sphere, division, cubic, omni",
         ),
         ({"D": [0.1, 0.2, 0.3]}, "radtan takes"),
         ({"model": "equidistant", "D": [0.1]}, "equidistant takes"),

@@ -14,6 +14,7 @@ SPREAD = {  # of coefficients, far beyond those of real lenses
     "thin_prism_fisheye": [0.2, 0.1, 0.02, 0.02, 0.05, 0.02, 0.02, 0.02],
     "radtan_thin_prism_fisheye": [0.3, 0.2, 0.2, 0.1, 0.05, 0.01, 0.02, 0.02, 0.02, 0.02, 0.02, 0.02],
     "division": [0.3],
+    "cubic": [0.3],
     "equirectangular": [],
 }
 BOUNDS = {"fov": [(0.05, 3.0)], "eucm": [(0, 1), (0.3, 3)], "double_sphere": [(-0.95, 1), (0, 1)], "omni": [(0, 3)]}

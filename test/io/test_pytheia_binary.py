@@ -180,6 +180,8 @@ def test_pytheias_camera_models(theirs, tmp_path, model) -> None:
     [
         Camera("radtan", [500, 500, 320, 240], [0, 0, 0, 0, 0, 0.1, 0, 0], 640, 480),
         Camera("division", [500, 510, 320, 240], [-0.1], 640, 480),
+        Camera("cubic", [500, 500, 320, 240], [-0.1], 640, 480),
+        Camera("omni", [500, 500, 320, 240], [1.2, 0, 0, 0, 0], 640, 480),
     ],
 )
 def test_lenses_that_pytheia_has_not(tmp_path, camera) -> None:

@@ -93,6 +93,7 @@ CAMERAS = [
     ("eucm", [0.62, 1.08], "eucm"),
     ("double_sphere", [-0.18, 0.59], "double_sphere"),
     ("division", [-0.12], "division"),
+    ("cubic", [0.15], "cubic"),
     ("omni", [1.2, -0.1, 0.01, 1e-3, 2e-3], "omni"),
     ("thin_prism_fisheye", [0.1, -0.02, 1e-3, 1e-3, 0.01, 0.02, 1e-3, 2e-3], "thin_prism_fisheye"),
     (

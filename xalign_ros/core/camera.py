@@ -11,6 +11,8 @@ pixels u = f m + c. By their coefficients D:
 `double_sphere` xi alpha: Usenko et al. ("The double sphere camera model", 2018).
 `division` k: Fitzgibbon, r = r_d / (1 + k r_d^2) ("Simultaneous linear estimation of multiple view geometry and lens
   distortion", 2001).
+`cubic` k: r = r_d (1 + k r_d^2), the measured pixel taken to the undistorted one: VisualSFM's (Wu, "Towards linear-time
+  incremental structure from motion", 2013).
 `omni` xi k1 k2 p1 p2: Mei and Rives ("Single view point omnidirectional camera calibration from planar grids", 2007):
   (x, y) / (z + xi |xyz|), then radtan.
 `thin_prism_fisheye` k1 k2 p1 p2 k3 k4 sx sy: COLMAP's; theta (x, y) / r, then radial, tangential and prism terms as in
@@ -40,6 +42,7 @@ MODELS = {
     "eucm": (2,),
     "double_sphere": (2,),
     "division": (1,),
+    "cubic": (1,),
     "omni": (5,),
     "thin_prism_fisheye": (8,),
     "radtan_thin_prism_fisheye": (12,),

@@ -98,6 +98,19 @@ def _division(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
     return r / w, 1 / w + 2 * D[0] * r * r / (root * w**2), -r * (1 + z / root) / (2 * w**2)
 
 
+def _cubic(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
+    z = np.where(z > 0, z, np.nan)  # rays from behind have no pixel
+    u, c = r / z, np.sqrt(3 * np.abs(D[0]))
+    # The root of q + k q^3 = u that grows from zero.
+    q = (
+        u
+        if c == 0
+        else 2 / c * (np.sinh(np.arcsinh(1.5 * c * u) / 3) if D[0] > 0 else np.sin(np.arcsin(1.5 * c * u) / 3))
+    )
+    slope = 1 / (1 + 3 * D[0] * q * q)
+    return q, slope / z, -slope * u / z
+
+
 def _mirror(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
     n = np.hypot(r, z)
     w = z + D[0] * n
@@ -125,6 +138,11 @@ def _division_ray(D: Array, q: Array) -> tuple[Array, Array]:
     return q, np.where(k < 1, 1 + k, np.nan)  # from 1 on, rays turn back to the axis
 
 
+def _cubic_ray(D: Array, q: Array) -> tuple[Array, Array]:
+    rising = 1 + 3 * D[0] * q * q > 0
+    return q * (1 + D[0] * q * q), np.where(rising, 1.0, np.nan)
+
+
 def _mirror_ray(D: Array, q: Array) -> tuple[Array, Array]:
     k = (D[0] + np.sqrt(1 + (1 - D[0] ** 2) * q * q)) / (1 + q * q)
     return k * q, k - D[0]
@@ -136,6 +154,13 @@ RADIAL = {
     "eucm": _eucm,
     "double_sphere": _double_sphere,
     "division": _division,
+    "cubic": _cubic,
     "mirror": _mirror,
 }
-_RAY = {"eucm": _eucm_ray, "double_sphere": _double_sphere_ray, "division": _division_ray, "mirror": _mirror_ray}
+_RAY = {
+    "eucm": _eucm_ray,
+    "double_sphere": _double_sphere_ray,
+    "division": _division_ray,
+    "cubic": _cubic_ray,
+    "mirror": _mirror_ray,
+}

@@ -1,6 +1,7 @@
 """pyTheia's camera models and ours: the same lenses, parameters in another order.
 
-Of pyTheia's models only ORTHOGRAPHIC has no counterpart here; here only radtan with k4 k5 k6 has none there.
+Of pyTheia's models only ORTHOGRAPHIC has no counterpart here; here radtan with k4 k5 k6, omni, cubic, and the lenses of
+COLMAP with a thin prism have none there.
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ def camera_of_params(kind: str, params: Array, width: int, height: int) -> Camer
 def params_of_camera(camera: Camera) -> tuple[str, Array]:
     """Class and parameters. Raises ValueError where pyTheia has no such lens."""
     model, D, aspect = camera.model, camera.D, camera.K[1] / camera.K[0]
-    kind = next(k for k, (*_, ours) in _MODELS.items() if ours == model)
+    kind = next((k for k, (*_, ours) in _MODELS.items() if ours == model), "")
+    if not kind:
+        raise ValueError(f"pyTheia has no {model} camera")
     if model == "radtan":
         d = np.zeros(8)
         d[: len(D)] = D

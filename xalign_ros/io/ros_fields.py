@@ -34,6 +34,7 @@ DISTORTION_MODELS = {
     "eucm": "eucm",
     "double_sphere": "double_sphere",
     "division": "division",
+    "cubic": "cubic",
     "omni": "omni",
     "thin_prism_fisheye": "thin_prism_fisheye",
     "radtan_thin_prism_fisheye": "radtan_thin_prism_fisheye",
