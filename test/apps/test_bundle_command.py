@@ -1,4 +1,4 @@
-"""xalign bundle on files of both kinds."""
+"""xalign bundle on files of every kind."""
 
 import json
 from dataclasses import replace
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from view_list_samples import holdable
 
 from xalign_ros.apps.main import main
 from xalign_ros.core.camera import Camera
@@ -49,6 +50,25 @@ def test_shaken_models_come_back_to_the_truth(folder, truth, tmp_path: Path, cap
     np.testing.assert_allclose(found.points, truth.points, atol=1e-4)
     assert main(command) == 1 and "--force" in capsys.readouterr().err
     assert main([*command, "--force"]) == 0
+
+
+@pytest.mark.parametrize("ending", [".nvm", ".out"])
+def test_formats_of_other_programs_in_and_out(ending, tmp_path: Path, capsys) -> None:
+    truth, rng = holdable(ending, 0), np.random.default_rng(0)
+    source, output = tmp_path / f"model{ending}", tmp_path / f"out{ending}"
+    points = truth.points + rng.normal(0, 0.05, truth.points.shape)
+    write_reconstruction(replace(truth, points=points), source, folder=True)
+    held = [word for name in truth.names for word in ("--hold", name)]
+    assert main(["bundle", str(source), "-o", str(output), *held]) == 0
+    assert "images are not beside it" in capsys.readouterr().err
+    often = np.diff(truth.offsets) > 1
+    np.testing.assert_allclose(read_reconstruction(output).points[often], truth.points[often], atol=1e-5)
+    folder = tmp_path / "folder"  # no ending: COLMAP's, which has not VisualSFM's lens
+    assert main(["bundle", str(source), "-o", str(folder), *held]) == (ending == ".nvm")
+    if ending == ".out":
+        np.testing.assert_allclose(read_reconstruction(folder).points[often], truth.points[often], atol=1e-5)
+    else:
+        assert "COLMAP has no cubic camera" in capsys.readouterr().err and not folder.exists()
 
 
 def test_intrinsics_that_are_refined_come_back(truth, tmp_path: Path, capsys) -> None:

@@ -15,14 +15,21 @@ from xalign_ros.core.errors import MapError
 from xalign_ros.core.pose_graph import LOSSES, Loss
 from xalign_ros.core.reconstruction import Reconstruction
 from xalign_ros.io.loss_option import loss_of
-from xalign_ros.io.reconstruction_files import read_reconstruction, write_reconstruction
+from xalign_ros.io.reconstruction_files import (
+    as_folder,
+    read_reconstruction,
+    refuse_existing,
+    write_reconstruction,
+)
 
 WIDTH = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("model", type=Path, metavar="MODEL", help="folder of a COLMAP model, or pyTheia's file")
-    told = "adjusted, in the format that the name ends in (.ply, .json), else in that of MODEL"
+    parser.add_argument(
+        "model", type=Path, metavar="MODEL", help="folder of a COLMAP model, X.nvm, X.out, or pyTheia's file"
+    )
+    told = "adjusted, in the format that the name ends in (.nvm, .out, .ply, .json), else in that of MODEL"
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help=told)
     parser.add_argument("--force", action="store_true", help="replace an existing output")
     parser.add_argument(
@@ -48,9 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Without --hold and priors the first estimated view stays and the scale is as the points have it."""
-    if args.output.exists() and not args.force:
-        raise MapError(f"{args.output} exists; give another name or --force to replace it")
-    r = read_reconstruction(args.model)
+    if not args.force:
+        refuse_existing(args.output)
+    r = read_reconstruction(args.model, _tell)
     held = _held(args.model, r, args.hold)
     if not held.any() and r.priors is None and not args.hold_points:
         held[np.flatnonzero(r.estimated)[:1]] = True
@@ -64,7 +71,8 @@ def run(args: argparse.Namespace) -> None:
         )
     except ValueError as error:
         raise MapError(f"{args.model}: {error}") from error
-    write_reconstruction(done.reconstruction, args.output, folder=args.model.is_dir(), force=args.force)
+    folder = as_folder(args.model)
+    write_reconstruction(done.reconstruction, args.output, folder=folder, force=args.force, tell=_tell)
     if not done.converged:
         print("it has not converged; what is written is the best found", file=sys.stderr)
     result = {
@@ -79,6 +87,10 @@ def run(args: argparse.Namespace) -> None:
         "converged": done.converged,
     }
     print(json.dumps(result) if args.json else "\n".join(f"{key:22s} {value}" for key, value in result.items()))
+
+
+def _tell(words: str) -> None:
+    print(words, file=sys.stderr)
 
 
 def _held(path: Path, r: Reconstruction, names: list[str]) -> np.ndarray:
