@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import run_pair
+from PIL import Image
 
 from xalign_ros.apps.main import main
 from xalign_ros.core.similarity import fit_similarity
 from xalign_ros.io.pytheia_writer import write_pytheia
-from xalign_ros.io.reconstruction_files import read_reconstruction
+from xalign_ros.io.reconstruction_files import read_reconstruction, write_reconstruction
 from xalign_ros.io.tum import read_tum
 
 
@@ -30,6 +31,8 @@ def files(pair, tmp_path_factory):
         write_pytheia(getattr(pair, name), folder / f"{name}.bin")
         (folder / name).mkdir()
         run_pair.write_colmap(getattr(pair, name), folder / name, len(name))
+        (folder / f"hloc_{name}").mkdir()
+        run_pair.write_hloc(getattr(pair, name), folder / f"hloc_{name}", len(name))
     return folder
 
 
@@ -60,6 +63,20 @@ def test_the_run_comes_into_frame_and_scale(kind, pair, files, tmp_path, capsys)
     best = rms(fit_similarity(pair.run.t, pair.truth.t).apply(pair.run.t) - pair.truth.t)
     assert error[0][0] < 0.02 * best
     assert error[1][0] < 0.6 * error[0][0] and error[1][1] < 0.03  # points of the run are as its pixels have them
+
+
+def test_hlocs_folder_and_files_of_others(pair, files, tmp_path, capsys) -> None:
+    """A folder of hloc's is found to be one; an NVM file of the same model takes hloc's features by pixel."""
+    run, segment = (files / f"hloc_{name}" / "sfm_superpoint+superglue" for name in ("run", "segment"))
+    best = rms(fit_similarity(pair.run.t, pair.truth.t).apply(pair.run.t) - pair.truth.t)
+    assert align(run, segment, "-o", tmp_path / "out") == 0
+    assert rms(read_reconstruction(tmp_path / "out").t - pair.truth.t) < 0.02 * best
+    for name in pair.run.names:
+        Image.new("L", (640, 480)).save(tmp_path / name)
+    write_reconstruction(pair.run, tmp_path / "run.nvm", folder=True)
+    features = ("--run-features", files / "hloc_run" / "feats-superpoint-n4096-r1024.h5")
+    assert align(tmp_path / "run.nvm", segment, "-o", tmp_path / "out.out", *features) == 0
+    assert rms(read_reconstruction(tmp_path / "out.out").t - pair.truth.t) < 0.02 * best
 
 
 def test_names_are_ordered_by_their_numbers_and_give_stamps(pair, files, tmp_path, capsys) -> None:
@@ -110,6 +127,6 @@ def test_a_model_without_its_database_says_so(pair, tmp_path, capsys) -> None:
     (tmp_path / "a" / "b" / "c" / "database.db").rename(tmp_path / "moved.db")
     sparse = tmp_path / "a" / "b" / "c" / "sparse"
     assert align(sparse, sparse, "-o", tmp_path / "out") == 1
-    assert "there is no database.db there or beside it" in capsys.readouterr().err
+    assert "there is no database.db with descriptors and no feats-*.h5 there or beside it" in capsys.readouterr().err
     more = ("--run-database", tmp_path / "moved.db", "--segment-database", tmp_path / "moved.db")
     assert align(sparse, sparse, "-o", tmp_path / "out", *more) == 0

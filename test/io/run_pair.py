@@ -6,6 +6,7 @@ import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 from colmap_samples import add_features, old_database
 
@@ -125,6 +126,24 @@ def write_colmap(r: Reconstruction, folder: Path, seed: int = 0) -> Path:
         add_features(db, image.name, (len(image.uv), 6, keypoints.tobytes()), (len(codes), 128, codes.tobytes()))
     db.close()
     return folder / "sparse"
+
+
+def write_hloc(r: Reconstruction, folder: Path, seed: int = 0) -> Path:
+    """As hloc leaves it: a COLMAP model in a folder with a database that has no descriptors, the features beside it."""
+    rng = np.random.default_rng(seed)
+    model = model_of_reconstruction(r)
+    write_model(model, folder / "sfm_superpoint+superglue", binary=True)
+    old_database(folder / "sfm_superpoint+superglue" / "database.db").close()
+    row = {int(track): n for n, track in enumerate(r.track_ids)}
+    assert r.descriptors is not None
+    with h5py.File(folder / "feats-superpoint-n4096-r1024.h5", "w") as file:
+        for image in model.images.values():
+            codes = r.descriptors[[row[int(p)] for p in image.point_ids]] - 127.5
+            codes = codes + rng.normal(0, FLIP, codes.shape)
+            group = file.create_group(image.name)
+            group["keypoints"] = image.uv.astype(np.float16)
+            group["descriptors"] = (codes / np.linalg.norm(codes, axis=1, keepdims=True)).T.astype(np.float16)
+    return folder / "sfm_superpoint+superglue"
 
 
 def similarity(seed: int) -> Sim3:

@@ -22,21 +22,24 @@ from xalign_ros.io.config_file import read_config
 from xalign_ros.io.described import Described, read_described
 from xalign_ros.io.images import image_stamp_ns
 from xalign_ros.io.progress_bar import progress_bar
-from xalign_ros.io.reconstruction_files import write_reconstruction
+from xalign_ros.io.reconstruction_files import as_folder, refuse_existing, write_reconstruction
 from xalign_ros.io.run_output import in_words
 from xalign_ros.io.tum import Trajectory, write_tum
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    kinds = "folder of a COLMAP model, or pyTheia's file with descriptors"
+    kinds = "folder of a COLMAP model, X.nvm, X.out, or pyTheia's file"
     parser.add_argument("run", type=Path, metavar="RUN", help=f"what is brought over: {kinds}")
     parser.add_argument("segment", type=Path, metavar="SEGMENT", help=f"whose frame and scale it gets: {kinds}")
-    told = "the run in the segment's frame, in the format that the name ends in (.ply, .json), else in that of RUN; "
+    told = "the run in the segment's frame, in the format that the name ends in (.nvm, .out, .ply, .json), else in that of RUN; "
     told += "its poses go to OUT.tum"
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help=told)
     for name in ("run", "segment"):
-        told = f"COLMAP's, of the {name}'s features (default: database.db in or beside the model)"
-        parser.add_argument(f"--{name}-database", type=Path, metavar="DB", help=told)
+        told = (
+            f"the {name}'s features: COLMAP's database or hloc's .h5 (default: database.db or feats-*.h5 in or beside "
+        )
+        told += "the model, or the descriptors of pyTheia's tracks)"
+        parser.add_argument(f"--{name}-database", f"--{name}-features", type=Path, metavar="FILE", help=told)
     told = "adjust poses and points, too, by reprojection, the segment's points held"
     parser.add_argument("--bundle", action="store_true", help=told)
     parser.add_argument("--force", action="store_true", help="replace existing outputs")
@@ -48,11 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Raises XalignError on bad input, and where too few views of the run are found in the segment."""
     poses = args.output.with_name(args.output.name + ".tum")
-    for path in (args.output, poses):
-        if path.exists() and not args.force:
-            raise MapError(f"{path} exists; give another name or --force to replace it")
+    if not args.force:
+        refuse_existing(args.output)
+        refuse_existing(poses)
     config = read_config(args.config, args.set)
-    source, segment = read_described(args.run, args.run_database), read_described(args.segment, args.segment_database)
+    source = read_described(args.run, args.run_database, _tell)
+    segment = read_described(args.segment, args.segment_database, _tell)
     index, keyframes, order = _index(args.segment, segment), source.keyframes(), source.order()
     _check_same_descriptors(source, segment)
     in_order = replace(source.reconstruction, stamps_ns=None)  # every estimated view is a node, none is interpolated
@@ -74,9 +78,13 @@ def run(args: argparse.Namespace) -> None:
     except ValueError as error:
         raise MapError(f"{args.run}: {error}") from error
     final = replace(final, stamps_ns=source.reconstruction.stamps_ns)
-    write_reconstruction(final, args.output, folder=args.run.is_dir(), force=args.force)
+    write_reconstruction(final, args.output, folder=as_folder(args.run), force=args.force, tell=_tell)
     write_tum(poses, _trajectory(final, order))
     print(json.dumps(result) if args.json else in_words(result))
+
+
+def _tell(words: str) -> None:
+    print(words, file=sys.stderr)
 
 
 def _index(path: Path, segment: Described) -> MapIndex:

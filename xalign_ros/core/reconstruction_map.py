@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.lie import Array
@@ -131,6 +132,48 @@ def described_tracks(r: Reconstruction, descriptor_name: str) -> PosedReconstruc
         points=r.points[told],
         descriptor_name=descriptor_name,
         norm=Norm.L2_FLOAT32,
+    )
+
+
+def described_pixels(
+    r: Reconstruction,
+    features: Mapping[str, tuple[Array, np.ndarray]],
+    descriptor_name: str,
+    norm: Norm,
+    same_px: float,
+) -> PosedReconstruction:
+    """The views that have a pose and a camera, with all of their images' features, by name: uv (N, 2) px, descriptors.
+
+    A track's point belongs to the feature nearest to the pixel where a view sees it, which is then where it is. Raises
+    ValueError where no view has a pose and a camera, and where a pixel has no feature within same_px.
+    """
+    names, _, poses = posed_views(r)
+    views = _usable(r)
+    row = np.repeat(np.arange(len(r.points)), np.diff(r.offsets))
+    points, pixels = [], []
+    for view, name in zip(views.tolist(), names, strict=True):
+        seen = (r.observing_views == view) & r.track_estimated[row]
+        uv, of = np.array(features[name][0]), np.full(len(features[name][0]), -1)
+        gap_px, near = cKDTree(uv).query(r.uv[seen]) if len(uv) else (np.full(seen.sum(), np.inf), np.zeros(0, int))
+        if (gap_px > same_px).any():
+            told = (
+                f"{(gap_px > same_px).sum()} of the {seen.sum()} pixels of image {name!r} are at none of its {len(uv)}"
+            )
+            raise ValueError(f"{told} features")
+        of[near], uv[near] = row[seen], r.uv[seen]
+        points.append(of)
+        pixels.append(uv)
+    return PosedReconstruction(
+        cameras=r.cameras,
+        keyframe_camera=np.zeros(0) if r.camera is None else r.camera[views],
+        names=tuple(names),
+        T_map_cam=tuple(poses),
+        uv=tuple(pixels),
+        descriptors=tuple(features[name][1] for name in names),
+        point=tuple(points),
+        points=r.points,
+        descriptor_name=descriptor_name,
+        norm=norm,
     )
 
 

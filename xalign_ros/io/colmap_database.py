@@ -51,6 +51,12 @@ def read_descriptor_names(path: Path, names: Iterable[str]) -> set[str]:
     return {_DESCRIPTORS.get(kind, f"type {kind}").lower() for kind in kinds}
 
 
+def has_descriptors(path: Path) -> bool:
+    """Of any image. Raises MapError where the file is no such database."""
+    with _opened(path) as db:
+        return db.execute("SELECT 1 FROM descriptors WHERE rows > 0 LIMIT 1").fetchone() is not None
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     """The database, to read from; what fails inside is a MapError."""

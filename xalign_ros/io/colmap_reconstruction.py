@@ -58,7 +58,7 @@ def read_colmap_reconstruction(model_dir: Path, database: Path, descriptor: str 
     features = read_database(database, [image.name for image in images])
     for image in images:
         _check_same_keypoints(database, image, features[image.name][0])
-    name, norm = _descriptor(database, features, descriptor)
+    name, norm = descriptor_kind(database, features, descriptor)
     return posed_reconstruction(model_dir, model, images, [features[image.name] for image in images], name, norm)
 
 
@@ -148,7 +148,8 @@ def _check_same_keypoints(path: Path, image: ColmapImage, uv: Array) -> None:
         raise MapError(f"{path}: {what}; {todo}.")
 
 
-def _descriptor(path: Path, features: dict[str, tuple[Array, NDArray[Any]]], name: str) -> tuple[str, Norm]:
+def descriptor_kind(path: Path, features: dict[str, tuple[Array, NDArray[Any]]], name: str) -> tuple[str, Norm]:
+    """Name, `name` where the database says none, and norm. Raises MapError where they are of several kinds."""
     kinds = {(desc.dtype, desc.shape[1]) for _, desc in features.values() if len(desc)}
     said = read_descriptor_names(path, features)
     if len(kinds) != 1 or len(said) > 1:

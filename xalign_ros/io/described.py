@@ -1,4 +1,8 @@
-"""A reconstruction with what its views look like: COLMAP's model with its database, or pyTheia's file with descriptors."""
+"""A reconstruction with what its views look like: by descriptors of its tracks, or with a file of its images' features.
+
+Such a file is COLMAP's database or hloc's HDF5. To a COLMAP model the features belong row by row, to any other file by
+pixel.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +14,19 @@ import numpy as np
 
 from xalign_ros.core.errors import MapError
 from xalign_ros.core.reconstruction import Reconstruction
-from xalign_ros.core.reconstruction_map import PosedReconstruction, described_tracks
-from xalign_ros.core.records import Features, Keyframe
+from xalign_ros.core.reconstruction_map import PosedReconstruction, described_pixels, described_tracks
+from xalign_ros.core.records import Features, Keyframe, Norm
 from xalign_ros.core.transforms import SE3
-from xalign_ros.io.colmap_reconstruction import read_colmap_reconstruction
-from xalign_ros.io.reconstruction_files import read_reconstruction
+from xalign_ros.io.colmap_database import has_descriptors, read_database
+from xalign_ros.io.colmap_reconstruction import SAME_PX, descriptor_kind, read_colmap_reconstruction
+from xalign_ros.io.hloc import ROUNDED_PX, descriptor_width, features_name, read_features, read_hloc_reconstruction
+from xalign_ros.io.reconstruction_files import READERS, nobody, read_reconstruction
+from xalign_ros.io.view_lists import Tell
 
-DATABASE = (
-    "database.db"  # of COLMAP, in the model's folder or up to two above: the layout of its automatic reconstructor
-)
+# In the model's folder or up to two above: the layouts of COLMAP's automatic reconstructor and of hloc, whose own
+# database has no descriptors.
+DATABASE, HLOC = "database.db", "feats-*.h5"
+HDF5 = (".h5", ".hdf5")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,23 +60,51 @@ class Described:
         return out
 
 
-def read_described(path: Path, database: Path | None) -> Described:
-    """Raises MapError where it is neither, or nothing says what its views look like."""
-    r = read_reconstruction(path)
+def read_described(path: Path, features: Path | None, tell: Tell = nobody) -> Described:
+    """Raises MapError where it is no reconstruction, or nothing says what its views look like."""
+    r = read_reconstruction(path, tell)
     try:
-        if not path.is_dir():
+        if features is None and not path.is_dir() and path.suffix not in READERS:
             return Described(r, described_tracks(r, "sift"))
-        near = [folder / DATABASE for folder in (path, *path.resolve().parents[:2])]
-        database = database or next((p for p in near if p.is_file()), None)
-        if database is None:
-            raise MapError(
-                f"{path}: there is no {DATABASE} there or beside it; name the database of the model's features"
-            )
+        features = features or _near(path)
         if len(set(r.names)) < len(r.names):
             raise MapError(f"{path}: two images have one name")
-        return Described(r, read_colmap_reconstruction(path, database))
+        if not path.is_dir():
+            return Described(r, _by_pixel(r, features))
+        read = read_hloc_reconstruction if features.suffix in HDF5 else read_colmap_reconstruction
+        return Described(r, read(path, features))
     except ValueError as error:
         raise MapError(f"{path}: {error}") from error
+
+
+def _near(path: Path) -> Path:
+    """The nearest file of features. Raises MapError where there is none, or more than one at a time."""
+    base = path if path.is_dir() else path.parent
+    for folder in (base, *base.resolve().parents[:2]):
+        database, hloc = folder / DATABASE, sorted(folder.glob(HLOC))
+        if database.is_file() and has_descriptors(database):
+            return database
+        if len(hloc) > 1:
+            raise MapError(f"{path}: there are {len(hloc)} files {HLOC} in {folder}; name the one of the model")
+        if hloc:
+            return hloc[0]
+    what = f"there is no {DATABASE} with descriptors and no {HLOC} there or beside it"
+    raise MapError(f"{path}: {what}; name the database, or hloc's file, of the model's features")
+
+
+def _by_pixel(r: Reconstruction, path: Path) -> PosedReconstruction:
+    names = [name for name, estimated in zip(r.names, r.estimated, strict=True) if estimated]
+    if path.suffix in HDF5:
+        found = read_features(path, names)
+        name, norm, same_px = features_name(path), Norm.L2_FLOAT32, ROUNDED_PX
+        descriptor_width(path, found)
+    else:
+        found, same_px = read_database(path, names), SAME_PX
+        name, norm = descriptor_kind(path, found, "")
+    try:
+        return described_pixels(r, found, name, norm, same_px)
+    except ValueError as error:
+        raise MapError(f"{path}: {error}; give the features that the model was made from.") from error
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

@@ -37,14 +37,25 @@ def read_hloc_reconstruction(model_dir: Path, features: Path, descriptor: str = 
         if apart_px > max(ROUNDED_PX, 2e-3 * float(np.abs(image.uv).max(initial=0))):
             what = f"the {len(uv)} keypoints of image {image.name!r} are not the model's {len(image.uv)} row by row"
             raise MapError(f"{features}: {what}; give the features that the model was triangulated from.")
-    widths = sorted({d.shape[1] for _, d in found.values() if len(d)})
-    if len(widths) != 1:
-        raise MapError(f"{features}: has descriptors of {len(widths)} lengths {widths}; a map needs one.")
-    named = _NAMED.match(features.stem)
-    name = descriptor or (named[1].lower() if named else features.stem)
+    descriptor_width(features, found)
+    name = descriptor or features_name(features)
     return posed_reconstruction(
         model_dir, model, images, [(i.uv, found[i.name][1]) for i in images], name, Norm.L2_FLOAT32
     )
+
+
+def descriptor_width(path: Path, found: dict[str, tuple[Array, np.ndarray]]) -> int:
+    """Of all images. Raises MapError where it is not one."""
+    widths = sorted({d.shape[1] for _, d in found.values() if len(d)})
+    if len(widths) != 1:
+        raise MapError(f"{path}: has descriptors of {len(widths)} lengths {widths}; a map needs one.")
+    return int(widths[0])
+
+
+def features_name(path: Path) -> str:
+    """What hloc calls the descriptors in the file's name, else that name."""
+    named = _NAMED.match(path.stem)
+    return named[1].lower() if named else path.stem
 
 
 def read_features(path: Path, names: Iterable[str]) -> dict[str, tuple[Array, np.ndarray]]:
