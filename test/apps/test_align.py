@@ -65,6 +65,29 @@ def test_the_run_comes_into_frame_and_scale(kind, pair, files, tmp_path, capsys)
     assert error[1][0] < 0.6 * error[0][0] and error[1][1] < 0.03  # points of the run are as its pixels have them
 
 
+def test_one_similarity_by_points_and_by_surfaces(tmp_path, capsys) -> None:
+    """Of points that slid along a street's walls; along it only the sliding points tell where the run is."""
+    pair = run_pair.slid_pair()
+    S = fit_similarity(pair.run.t, pair.truth.t)
+    for name in ("run", "segment"):
+        write_pytheia(getattr(pair, name), tmp_path / name)
+    aside = {}
+    for how in ("points", "surfaces"):
+        assert align(tmp_path / "run", tmp_path / "segment", "-o", tmp_path / how, "--similarity", how, "--json") == 0
+        result = json.loads(capsys.readouterr().out)
+        aside[how] = rms((read_reconstruction(tmp_path / how).t - pair.truth.t)[:, 1:])
+        assert abs(np.log(result["scale"] / S.s)) < 4 * result["scale_sigma"] < 0.03
+        assert result["views_aligned"] == 30 and result["points"] > 300
+        assert (result["points_on_surfaces"] > 200) == (how == "surfaces")
+        assert (result["sigma_across"] is None) == (how == "points")
+        assert len(read_tum(tmp_path / f"{how}.tum").t) == 30
+    assert result["sigma_across"] < 0.05 * result["sigma_along"]
+    assert aside["surfaces"] < 0.2 * aside["points"]
+    with pytest.raises(SystemExit) as stop:
+        align(tmp_path / "run", tmp_path / "segment", "-o", tmp_path / "o", "--similarity", "points", "--bundle")
+    assert stop.value.code == 2
+
+
 def test_hlocs_folder_and_files_of_others(pair, files, tmp_path, capsys) -> None:
     """A folder of hloc's is found to be one; an NVM file of the same model takes hloc's features by pixel."""
     run, segment = (files / f"hloc_{name}" / "sfm_superpoint+superglue" for name in ("run", "segment"))

@@ -124,6 +124,16 @@ def test_what_walls_leave_open_is_told_by_matches_and_unsure() -> None:
     assert turn[2] > 5 * turn[:2].max() and shift[:2].min() > 5 * shift[2]
 
 
+def test_without_any_error_across_what_is_open_is_told_all_the_same() -> None:
+    rng = np.random.default_rng(4)
+    y, n = walls(rng, 300)
+    kept = n[:, 0] == 0  # no wall stops a shift along x
+    fit = fit_similarity_to_surfaces(slid(rng, y[kept], n[kept], 0.1), y[kept], n[kept])
+    sigma = np.sqrt(np.diag(fit.cov))
+    assert fit.S.t[0] == pytest.approx(0, abs=4 * sigma[3]) and 1e-3 < sigma[3] < 0.02
+    np.testing.assert_allclose(fit.S.t[1:], 0, atol=1e-7)
+
+
 def test_what_leaves_the_similarity_open_is_an_error() -> None:
     line = np.arange(20.0)[:, None] * [1, 2, 3]
     none = np.full(line.shape, np.nan)

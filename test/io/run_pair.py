@@ -58,6 +58,23 @@ def pair(seed: int = 0, drift: float = 0.4, views: int = 60, segment_views: tupl
     return Pair(segment, _drifted(truth, rng, drift), truth)
 
 
+def slid_pair(seed: int = 0, views: int = 30, slide_m: float = 0.15) -> Pair:
+    """A street of two walls and a road. The run is the truth in another frame and unit, its points slid along these."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([0, -6, -2.5], [STEP_M * views + 8, 6, 2.5], (40 * views, 3))
+    axis, at = np.array([1, 1, 2]), np.array([-6, 6, -2.5])
+    side, rows = rng.integers(0, 3, len(points)), np.arange(len(points))
+    points[rows, axis[side]] = at[side]
+    codes = rng.integers(0, 256, (len(points), 128)).astype(np.float32)
+    segment = _seen(street(views, 0.0), points, codes, rng, "seg")
+    truth = _seen(street(views, 0.1), points, codes, rng, "run")
+    slide = rng.normal(0, slide_m, points.shape)
+    slide[rows, axis[side]] = 0
+    truth = replace(truth, points=truth.points + slide[truth.track_ids - 1])
+    S = similarity(seed)
+    return Pair(segment, replace(truth, R=S.R @ truth.R, t=S.apply(truth.t), points=S.apply(truth.points)), truth)
+
+
 def _seen(
     poses: list[SE3], points: np.ndarray, codes: np.ndarray, rng: np.random.Generator, name: str
 ) -> Reconstruction:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from xalign_ros.core.bundle import Bundled
 from xalign_ros.core.errors import MapError
 from xalign_ros.core.reconstruction import Reconstruction
 from xalign_ros.core.reconstruction_map import build_map_from_reconstruction
+from xalign_ros.core.records import Anchor
 from xalign_ros.core.reference_map import MapIndex
-from xalign_ros.core.run_alignment import AlignedRun, align_run
+from xalign_ros.core.run_alignment import AlignedRun, align_run, distances
 from xalign_ros.core.run_bundle import bundled
+from xalign_ros.core.run_similarity import SimilarRun, align_by_similarity
 from xalign_ros.io.config_file import read_config
 from xalign_ros.io.described import Described, read_described
 from xalign_ros.io.images import image_stamp_ns
@@ -40,8 +44,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )
         told += "the model, or the descriptors of pyTheia's tracks)"
         parser.add_argument(f"--{name}-database", f"--{name}-features", type=Path, metavar="FILE", help=told)
+    how = parser.add_mutually_exclusive_group()
     told = "adjust poses and points, too, by reprojection, the segment's points held"
-    parser.add_argument("--bundle", action="store_true", help=told)
+    how.add_argument("--bundle", action="store_true", help=told)
+    told = (
+        "one similarity for the whole run, for one that does not drift: by matched points, or by the errors of these "
+    )
+    told += "across and along the segment's surfaces"
+    how.add_argument("--similarity", choices=("points", "surfaces"), help=told)
     parser.add_argument("--force", action="store_true", help="replace existing outputs")
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with options that differ from the defaults")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one option; may be repeated")
@@ -61,20 +71,19 @@ def run(args: argparse.Namespace) -> None:
     _check_same_descriptors(source, segment)
     in_order = replace(source.reconstruction, stamps_ns=None)  # every estimated view is a node, none is interpolated
     try:
-        aligned = align_run(in_order, order, keyframes, index, config, progress_bar)
-        final, result = aligned.reconstruction, _told(aligned, len(in_order.names))
+        if args.similarity:
+            seen = source.points_seen(), source.posed.points, index, config
+            surfaces = args.similarity == "surfaces"
+            similar = align_by_similarity(in_order, keyframes, *seen, surfaces=surfaces, progress=progress_bar)
+            final, result = similar.reconstruction, _told_similar(similar, len(in_order.names), len(order))
+        else:
+            aligned = align_run(in_order, order, keyframes, index, config, progress_bar)
+            final, result = aligned.reconstruction, _told(aligned, len(in_order.names))
         if args.bundle:
-            done, points = bundled(aligned, in_order, keyframes, index, config)
+            done, count = bundled(aligned, in_order, keyframes, index, config)
             final = done.reconstruction
-            result["bundle"] = {
-                "observations": done.observations,
-                "segment_points": points,
-                "initial_cost": done.initial_cost,
-                "cost": done.cost,
-                "iterations": done.iterations,
-                "converged": done.converged,
-            }
-            result |= _residuals(replace(aligned, reconstruction=final))
+            result["bundle"] = _told_bundle(done, count)
+            result |= _residuals(final, aligned.anchors)
     except ValueError as error:
         raise MapError(f"{args.run}: {error}") from error
     final = replace(final, stamps_ns=source.reconstruction.stamps_ns)
@@ -116,12 +125,39 @@ def _told(aligned: AlignedRun, views: int) -> dict[str, Any]:
         "scale_median": float(np.median(s)),
         "iterations": solution.iterations,
         "converged": solution.converged,
-    } | _residuals(aligned)
+    } | _residuals(aligned.reconstruction, aligned.anchors)
 
 
-def _residuals(aligned: AlignedRun) -> dict[str, Any]:
+def _told_bundle(done: Bundled, segment_points: int) -> dict[str, Any]:
+    return {
+        "observations": done.observations,
+        "segment_points": segment_points,
+        "initial_cost": done.initial_cost,
+        "cost": done.cost,
+        "iterations": done.iterations,
+        "converged": done.converged,
+    }
+
+
+def _told_similar(similar: SimilarRun, views: int, aligned: int) -> dict[str, Any]:
+    fit = similar.fit
+    return {
+        "views": views,
+        "views_aligned": aligned,
+        "anchors_accepted": len(similar.anchors),
+        "anchors_rejected": dict(similar.rejected),
+        "scale": float(fit.S.s),
+        "scale_sigma": float(np.sqrt(fit.cov[6, 6])),
+        "points": len(fit.along),
+        "points_on_surfaces": int(np.isfinite(fit.across).sum()),
+        "sigma_across": float(fit.sigma_across) if np.isfinite(fit.sigma_across) else None,
+        "sigma_along": float(fit.sigma_along),
+    } | _residuals(similar.reconstruction, similar.anchors)
+
+
+def _residuals(r: Reconstruction, anchors: Mapping[int, Anchor]) -> dict[str, Any]:
     """How far the views with an anchor end from it: in the segment's unit and in degrees."""
-    gap, turn = aligned.distances(aligned.anchors)
+    gap, turn = distances(r, anchors)
     out = {"anchor_gap_median": gap, "anchor_turn_median_deg": np.rad2deg(turn)}
     return {name: float(np.median(values)) for name, values in out.items()}
 

@@ -40,12 +40,31 @@ class AlignedRun:
     rejected: Mapping[str, int]
 
     def distances(self, anchors: Mapping[int, Anchor]) -> tuple[Array, Array]:
-        """How far the poses are from anchors by row: (A,) in the segment's unit, (A,) rad."""
-        r, rows = self.reconstruction, list(anchors)
-        t = np.array([anchors[row].T_map_cam.t for row in rows]).reshape(-1, 3)
-        R = np.array([anchors[row].T_map_cam.R for row in rows]).reshape(-1, 3, 3)
-        turn = np.linalg.norm(so3_log(np.swapaxes(R, 1, 2) @ r.R[rows]), axis=1)
-        return np.linalg.norm(r.t[rows] - t, axis=1), turn
+        """As the function of that name, of the aligned poses."""
+        return distances(self.reconstruction, anchors)
+
+
+def distances(r: Reconstruction, anchors: Mapping[int, Anchor]) -> tuple[Array, Array]:
+    """How far poses are from anchors by row: (A,) in the anchors' unit, (A,) rad."""
+    rows = list(anchors)
+    t = np.array([anchors[row].T_map_cam.t for row in rows]).reshape(-1, 3)
+    R = np.array([anchors[row].T_map_cam.R for row in rows]).reshape(-1, 3, 3)
+    turn = np.linalg.norm(so3_log(np.swapaxes(R, 1, 2) @ r.R[rows]), axis=1)
+    return np.linalg.norm(r.t[rows] - t, axis=1), turn
+
+
+def views_found(
+    keyframes: Mapping[int, Keyframe], index: MapIndex, config: Config, progress: Progress = unseen
+) -> tuple[dict[int, Anchor], dict[int, str]]:
+    """By row: the anchors of views looked for in the segment alone, and why the others have none."""
+    anchors, reasons = dict[int, Anchor](), dict[int, str]()
+    for row, keyframe in progress(list(keyframes.items()), "looking for views in the segment"):
+        found = find_anywhere(keyframe, index, config)
+        if isinstance(found, Anchor):
+            anchors[row] = found
+        else:
+            reasons[row] = found.reason
+    return anchors, reasons
 
 
 def align_run(
@@ -60,13 +79,7 @@ def align_run(
 
     Raises ValueError, in words, where fewer than `lock.anchors` views are found in the segment and agree.
     """
-    anchors, reasons = dict[int, Anchor](), dict[int, str]()
-    for row, keyframe in progress(list(keyframes.items()), "looking for views in the segment"):
-        found = find_anywhere(keyframe, index, config)
-        if isinstance(found, Anchor):
-            anchors[row] = found
-        else:
-            reasons[row] = found.reason
+    anchors, reasons = views_found(keyframes, index, config, progress)
     return aligned_by(run, order, anchors, config, keyframes=keyframes, index=index, reasons=reasons)
 
 
@@ -83,7 +96,7 @@ def aligned_by(
     """As align_run, from anchors that are known; with `index` the other keyframes are looked for around the solution."""
     believed, why = dict(anchors), dict(reasons or {})
     for _ in range(ROUNDS):
-        _check(believed, order, config)
+        check_anchors(believed, order, config)
         moved, solution = _solved(run, order, believed, config)
         wrong = [
             row for row, chi2 in zip(_rows(believed, order), _chi2(solution), strict=True) if chi2 > config.lock.chi2
@@ -97,7 +110,7 @@ def aligned_by(
             break
         believed |= found
     else:
-        _check(believed, order, config)
+        check_anchors(believed, order, config)
         moved, solution = _solved(run, order, believed, config)
     rejected = Counter(reason for row, reason in why.items() if row not in believed)
     return AlignedRun(moved, order, solution, believed, dict(sorted(rejected.items())))
@@ -128,7 +141,8 @@ def graph_anchors(anchors: Mapping[int, Anchor], order: np.ndarray) -> Anchors:
     return Anchors(at, R.reshape(-1, 3, 3), t.reshape(-1, 3), np.ones(len(mine)), information, loss=LOSS)
 
 
-def _check(anchors: Mapping[int, Anchor], order: np.ndarray, config: Config) -> None:
+def check_anchors(anchors: Mapping[int, Anchor], order: np.ndarray, config: Config) -> None:
+    """Raises ValueError where they are fewer than an alignment needs."""
     if len(anchors) < config.lock.anchors:
         raise ValueError(
             f"{len(anchors)} of the run's {len(order)} views are found in the segment and agree, "

@@ -128,8 +128,15 @@ def _seen(
 ) -> tuple[np.ndarray, Array, Array, np.ndarray]:
     """Of one view: rows (M,) of it, pixels (M, 2), their sigmas (M,) px and the map points (M,) that it sees there.
 
-    A sigma is that of the keypoint and of the point, which is held, together; half of the information, as SHARE says.
+    Half of the information, as SHARE says.
     """
+    feature, point, sigma_px = seen_points(keyframe, T, index, config)
+    uv = keyframe.features.uv[feature]
+    return np.full(len(feature), row, np.int64), uv, sigma_px / np.sqrt(1 - SHARE), point
+
+
+def seen_points(keyframe: Keyframe, T: SE3, index: MapIndex, config: Config) -> tuple[np.ndarray, np.ndarray, Array]:
+    """Features (M,) of a view at T_map_cam, the map points (M,) that they are, sigma (M,) px of both together."""
     camera, features = keyframe.camera, keyframe.features
     assert camera is not None
     sigma_px = max(config.pnp.sigma_px, index.map.sigma_px)
@@ -141,5 +148,4 @@ def _seen(
     variance = sigma_px**2 + np.trace(J @ point_cov @ np.swapaxes(J, 1, 2), axis1=1, axis2=2) / 2
     off = np.square(uv - features.uv[m.feature]).sum(axis=1)
     good = valid & (off < config.pnp.threshold_sigmas**2 * variance)
-    sigma = np.sqrt(variance[good] / (1 - SHARE))
-    return np.full(good.sum(), row, np.int64), features.uv[m.feature][good], sigma, m.point[good]
+    return m.feature[good], m.point[good], np.sqrt(variance[good])

@@ -25,7 +25,8 @@ CAUCHY_SIGMAS = 3.0  # width of the loss
 FIRST_RATIO = 0.1  # sigma across over along, until both can be estimated
 ROUNDS, SETTLING = 100, 4  # of reweighting, and how many of them with FIRST_RATIO
 SETTLED = 1e-10  # step, over the spread of the points, that ends them
-EXACT = 1e-13  # sigma across, as a part of the coordinates, that is rounding
+EXACT = 1e-13  # sigma, as a part of the coordinates, that is rounding
+LEAST_RATIO = 1e-5  # that sigma across is weighed with; below it numbers would lose what only the sliding tells
 OPEN = 1e-12  # least over greatest eigenvalue of the scaled information of a similarity that is left open
 MEDIAN_1, MEDIAN_2 = 0.6745, 1.1774  # of a normal's absolute value, and of the length of two
 
@@ -122,7 +123,7 @@ def _whitened(
 ) -> tuple[Array, Array, Array]:
     """Errors (N, 3) over their sigmas, Jacobians (N, 3, 7) with respect to the right tangent of S, and weights (N,)."""
     # The root of a match's information, I / along + n n^T (1 / across - 1 / along).
-    extra = np.where(on, 1 / sigmas[0] - 1 / sigmas[1], 0.0)
+    extra = np.where(on, 1 / max(sigmas[0], LEAST_RATIO * sigmas[1]) - 1 / sigmas[1], 0.0)
     W = np.eye(3) / sigmas[1] + extra[:, None, None] * n[:, :, None] * n[:, None, :]
     M = S.s * W @ S.R
     J = np.concatenate([np.cross(x[:, None, :], M), M, M @ x[:, :, None]], axis=2)

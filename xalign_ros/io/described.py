@@ -7,6 +7,7 @@ pixel.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,18 +47,23 @@ class Described:
 
     def keyframes(self) -> dict[int, Keyframe]:
         """By row, along the run, of the views with features."""
-        p, r = self.posed, self.reconstruction
-        at = {name: k for k, name in enumerate(p.names)}
-        out = {}
-        for n, row in enumerate(self.order().tolist()):
-            k = at.get(r.names[row])
-            if k is not None and len(p.uv[k]):
-                features = Features(p.uv[k], p.descriptors[k], p.descriptor_name, p.norm)
-                camera = p.cameras[p.keyframe_camera[k]]
-                inside = camera.inside(features.uv, 1.0)
-                features = Features(p.uv[k][inside], p.descriptors[k][inside], p.descriptor_name, p.norm)
-                out[row] = Keyframe(n, 0, n, SE3(r.R[row], r.t[row]), camera, features)
+        p, r, out = self.posed, self.reconstruction, {}
+        for n, row, k, inside in self._featured():
+            features = Features(p.uv[k][inside], p.descriptors[k][inside], p.descriptor_name, p.norm)
+            out[row] = Keyframe(n, 0, n, SE3(r.R[row], r.t[row]), p.cameras[p.keyframe_camera[k]], features)
         return out
+
+    def points_seen(self) -> dict[int, np.ndarray]:
+        """By row as keyframes(): for each of its features the row of posed.points that it sees, -1 where none."""
+        return {row: self.posed.point[k][inside] for _, row, k, inside in self._featured()}
+
+    def _featured(self) -> Iterator[tuple[int, int, int, np.ndarray]]:
+        """Place in order(), row and keyframe of the views with features, and which of these are on the image."""
+        p, at = self.posed, {name: k for k, name in enumerate(self.posed.names)}
+        for n, row in enumerate(self.order().tolist()):
+            k = at.get(self.reconstruction.names[row])
+            if k is not None and len(p.uv[k]):
+                yield n, row, k, p.cameras[p.keyframe_camera[k]].inside(p.uv[k], 1.0)
 
 
 def read_described(path: Path, features: Path | None, tell: Tell = nobody) -> Described:
