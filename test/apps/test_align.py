@@ -44,7 +44,7 @@ def align(*words):
 def test_the_run_comes_into_frame_and_scale(kind, pair, files, tmp_path, capsys) -> None:
     run, segment = (files / n / "sparse" if kind == "colmap" else files / f"{n}.bin" for n in ("run", "segment"))
     error = {}
-    for more in ((), ("--bundle",)):
+    for more in ((), ("--bundle" if kind == "colmap" else "--inverse-depth",)):
         out = tmp_path / f"out{len(more)}"
         assert align(run, segment, "-o", out, "--json", *more) == 0
         result = json.loads(capsys.readouterr().out)

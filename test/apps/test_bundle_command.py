@@ -89,6 +89,31 @@ def test_points_that_stay_hold_the_frame(truth, tmp_path: Path, capsys) -> None:
     np.testing.assert_allclose(found.t, truth.t, atol=1e-6)
 
 
+@pytest.mark.parametrize("folder", [True, False], ids=["colmap", "pytheia"])
+def test_inverse_depths_take_stars_to_infinity(folder, truth, tmp_path: Path, capsys) -> None:
+    """Every second track is a star; COLMAP has no place for it."""
+    star = np.arange(50) % 2 == 0
+    ray = truth.points / np.linalg.norm(truth.points, axis=1, keepdims=True)
+    x = np.einsum("vji,pj->pvi", truth.R, ray)
+    uv = np.where(
+        star[:, None, None], CAMERA.project(x.reshape(-1, 3))[0].reshape(50, 6, 2), truth.uv.reshape(50, 6, 2)
+    )
+    uv += np.random.default_rng(0).normal(0, 0.3, uv.shape)  # half of the stars would be beyond infinity
+    start = replace(shaken(truth), uv=uv.reshape(-1, 2))
+    write_reconstruction(start, tmp_path / "m", folder=folder)
+    command = ["bundle", str(tmp_path / "m"), "-o", str(tmp_path / "o"), "--inverse-depth", "--json"]
+    assert main([*command, "--hold", "0.jpg", "--hold", "1.jpg"]) == 0
+    said = capsys.readouterr()
+    far, found = json.loads(said.out)["tracks_at_infinity"], read_reconstruction(tmp_path / "o")
+    assert far > 0 and (f"{far} tracks are at infinity" in said.err) == folder
+    assert len(found.track_ids) == (50 - far if folder else 50)
+    if not folder:
+        assert found.at_infinity.sum() == far and not found.at_infinity[~star].any()
+        again = [*command, "--hold", "0.jpg", "--force"]
+        again[1], again[3] = again[3], str(tmp_path / "again")
+        assert main(again) == 0 and json.loads(capsys.readouterr().out)["tracks"] == 50
+
+
 @pytest.mark.parametrize(
     "words, said", [(["--hold", "7.jpg"], "has no view '7.jpg'; its first is '0.jpg'"), (None, "there is nothing")]
 )

@@ -39,6 +39,19 @@ def test_fields_that_are_not_there_stay_so(tmp_path) -> None:
     assert_same(read_pytheia(tmp_path / "r.bin"), there)
 
 
+def test_tracks_at_infinity_keep_their_directions(tmp_path) -> None:
+    """They are estimated there, and marked here: who takes points has none of them."""
+    infinite = np.arange(20) % 3 == 0
+    there = replace(sample(2), track_estimated=~infinite, at_infinity=infinite)
+    size = np.linalg.norm(there.points, axis=1, keepdims=True)
+    there = replace(there, points=np.where(infinite[:, None], there.points / size, there.points))
+    write_pytheia(there, tmp_path / "r.bin")
+    back = read_pytheia(tmp_path / "r.bin")
+    np.testing.assert_array_equal(back.at_infinity, infinite)
+    np.testing.assert_array_equal(back.track_estimated, ~infinite)
+    np.testing.assert_allclose(back.points, there.points, rtol=1e-15)
+
+
 def test_an_empty_reconstruction(tmp_path) -> None:
     none, ids = np.zeros((0, 3)), np.zeros(0, int)
     empty = Reconstruction(ids, (), np.zeros((0, 3, 3)), none, ids, ids, none, ids, [0], ids, none[:, :2])

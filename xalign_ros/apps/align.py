@@ -47,6 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how = parser.add_mutually_exclusive_group()
     told = "adjust poses and points, too, by reprojection, the segment's points held"
     how.add_argument("--bundle", action="store_true", help=told)
+    told = "as --bundle, with tracks as bearings with inverse depths: for things far away"
+    how.add_argument("--inverse-depth", action="store_true", help=told)
     told = (
         "one similarity for the whole run, for one that does not drift: by matched points, or by the errors of these "
     )
@@ -69,7 +71,9 @@ def run(args: argparse.Namespace) -> None:
     segment = read_described(args.segment, args.segment_database, _tell)
     index, keyframes, order = _index(args.segment, segment), source.keyframes(), source.order()
     _check_same_descriptors(source, segment)
-    in_order = replace(source.reconstruction, stamps_ns=None)  # every estimated view is a node, none is interpolated
+    in_order = replace(  # every estimated view is a node, none is interpolated
+        source.reconstruction, stamps_ns=None, at_infinity=None
+    )
     try:
         if args.similarity:
             seen = source.points_seen(), source.posed.points, index, config
@@ -79,8 +83,8 @@ def run(args: argparse.Namespace) -> None:
         else:
             aligned = align_run(in_order, order, keyframes, index, config, progress_bar)
             final, result = aligned.reconstruction, _told(aligned, len(in_order.names))
-        if args.bundle:
-            done, count = bundled(aligned, in_order, keyframes, index, config)
+        if args.bundle or args.inverse_depth:
+            done, count = bundled(aligned, in_order, keyframes, index, config, inverse_depth=args.inverse_depth)
             final = done.reconstruction
             result["bundle"] = _told_bundle(done, count)
             result |= _residuals(final, aligned.anchors)
@@ -129,7 +133,9 @@ def _told(aligned: AlignedRun, views: int) -> dict[str, Any]:
 
 
 def _told_bundle(done: Bundled, segment_points: int) -> dict[str, Any]:
+    infinite = done.reconstruction.at_infinity
     return {
+        "tracks_at_infinity": 0 if infinite is None else int(infinite.sum()),
         "observations": done.observations,
         "segment_points": segment_points,
         "initial_cost": done.initial_cost,

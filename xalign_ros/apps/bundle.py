@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=REFINED,
         help="of the intrinsics, which views of one camera share; may be repeated",
     )
+    told = "tracks as bearings with inverse depths: for things far away, and points at infinity"
+    parser.add_argument("--inverse-depth", action="store_true", help=told)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of words")
 
 
@@ -58,6 +61,8 @@ def run(args: argparse.Namespace) -> None:
     if not args.force:
         refuse_existing(args.output)
     r = read_reconstruction(args.model, _tell)
+    if args.inverse_depth and r.at_infinity is not None:
+        r = replace(r, track_estimated=r.track_estimated | r.at_infinity)
     held = _held(args.model, r, args.hold)
     if not held.any() and r.priors is None and not args.hold_points:
         held[np.flatnonzero(r.estimated)[:1]] = True
@@ -68,17 +73,20 @@ def run(args: argparse.Namespace) -> None:
             constant_tracks=np.full(len(r.track_ids), args.hold_points),
             loss=args.robust,
             refined=args.refine,
+            inverse_depth=args.inverse_depth,
         )
     except ValueError as error:
         raise MapError(f"{args.model}: {error}") from error
-    folder = as_folder(args.model)
+    folder, infinite = as_folder(args.model), done.reconstruction.at_infinity
     write_reconstruction(done.reconstruction, args.output, folder=folder, force=args.force, tell=_tell)
+    far = 0 if infinite is None else int(infinite[done.reconstruction.track_estimated].sum())
     if not done.converged:
         print("it has not converged; what is written is the best found", file=sys.stderr)
     result = {
         "views": int(r.estimated.sum()),
         "views_held": int((held & r.estimated).sum()),
         "tracks": int(r.track_estimated.sum()),
+        "tracks_at_infinity": far,
         "observations": done.observations,
         "observations_skipped": done.skipped,
         "initial_cost": done.initial_cost,

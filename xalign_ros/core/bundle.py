@@ -7,14 +7,14 @@ Jacobians; every camera model that xalign has. docs/bundle.md has the mathematic
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from xalign_ros.core.bundle_factors import PoseEdges
 from xalign_ros.core.bundle_problem import Problem
 from xalign_ros.core.graph_band import SingularError
-from xalign_ros.core.lie import Array, project_rotation
+from xalign_ros.core.lie import Array
 from xalign_ros.core.pose_graph import Loss
 from xalign_ros.core.reconstruction import Reconstruction
 
@@ -53,25 +53,26 @@ def adjust(
     down_world: Sequence[float] = DOWN,
     gravity_as_cross: bool = True,
     refined: Collection[str] = (),
+    inverse_depth: bool = False,
     max_iterations: int = 100,
 ) -> Bundled:
     """Adjusts estimated views and tracks, but for the constant ones (masks (V,), (P,)); priors are those of the record.
 
     `loss` is on the whitened length of each reprojection, each block of edges has its own, `prior_loss` is on those of
     poses and gravity. `refined` names what is adjusted of the intrinsics, too, which all views of a camera share:
-    focal_length, aspect_ratio, principal_point, distortion. Views that are not estimated take no part. Raises ValueError
-    on an estimated view with observations but no camera, on edges and priors of views that are not estimated, on other
-    names, and where nothing is to be adjusted.
+    focal_length, aspect_ratio, principal_point, distortion. With inverse_depth tracks are bearings from their reference
+    views, refined, too, with inverse depths of 0 (a point at infinity) or more. Views that are not estimated take no
+    part. Raises ValueError on an estimated view with observations but no camera, on edges and priors of views that are
+    not estimated, on other names, on a track at infinity without inverse_depth, and where nothing is to be adjusted.
     """
-    problem = Problem(
-        reconstruction, edges, constant_views, constant_tracks, loss, prior_loss, down_world, gravity_as_cross, refined
-    )
+    known = (edges, constant_views, constant_tracks, loss, prior_loss, down_world, gravity_as_cross)
+    problem = Problem(reconstruction, *known, refined, inverse_depth)
     at, gains = problem.start, [np.inf]
     damping, iterations, converged = FIRST_DAMPING, 0, False
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         while iterations < max_iterations and not converged:
             iterations += 1
-            problem.system.build(at.reprojections, at.others, at.R)
+            problem.build(at)
             there, growth = problem.stepped(at, damping), 4.0
             while (there is None or not there.cost < at.cost) and damping <= MOST_DAMPING:
                 damping, growth = damping * growth, growth * 2
@@ -83,18 +84,16 @@ def adjust(
             more = _to_gain(*gains[-3:]) if damping <= GAUSS_NEWTON else np.inf
             converged = gains[-1] <= NOTHING * there.cost or more <= LEFT * there.cost
             at, damping = there, max(damping / 10, LEAST_DAMPING)
-    points = np.empty_like(at.X)
-    points[problem.order] = at.X
-    adjusted = replace(reconstruction, R=project_rotation(at.R), t=at.t, points=points, cameras=at.cameras)
     m, skipped = len(problem.observations), problem.skipped + int(at.reprojections.lost.sum())
-    return Bundled(adjusted, problem.start.cost, at.cost, iterations, converged, m, skipped)
+    return Bundled(problem.told(at), problem.start.cost, at.cost, iterations, converged, m, skipped)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariances:
     """Of views (V, 6, 6): rotation (rad) and translation, perturbation on the right of T_world_cam; of tracks (P, 3, 3).
 
-    Tracks are in world axes. Zero where constant, NaN where not estimated or where the observations leave it open.
+    Tracks are in world axes. Zero where constant, NaN where not estimated, at infinity, or where the observations leave
+    it open.
     """
 
     views: Array
@@ -111,18 +110,18 @@ def covariances(
     prior_loss: Loss | None = None,
     down_world: Sequence[float] = DOWN,
     gravity_as_cross: bool = True,
+    inverse_depth: bool = False,
 ) -> Covariances:
     """Of an adjusted reconstruction, from what adjust() was given: blocks of the inverse of the whole normal matrix.
     Intrinsics count as known.
 
     They are as true as sigma_px and the other weights. Raises ValueError where nothing holds the frame, and as adjust.
     """
-    problem = Problem(
-        reconstruction, edges, constant_views, constant_tracks, loss, prior_loss, down_world, gravity_as_cross
-    )
+    known = (edges, constant_views, constant_tracks, loss, prior_loss, down_world, gravity_as_cross)
+    problem = Problem(reconstruction, *known, inverse_depth=inverse_depth)
     at = problem.start
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        problem.system.build(at.reprojections, at.others, at.R)
+        problem.build(at)
         try:
             problem.system.reduce(0.0)
             views, points = problem.system.covariances()
@@ -134,6 +133,10 @@ def covariances(
     turn[:, :3, :3] = turn[:, 3:, 3:] = at.R
     views = np.swapaxes(turn, 1, 2) @ views @ turn
     views[~reconstruction.estimated] = np.nan
+    J = at.tracks.spread(at.t)
+    if J is not None:
+        moves = points.any(axis=(1, 2))
+        points[moves] = J[moves] @ points[moves] @ np.swapaxes(J[moves], 1, 2)
     tracks = np.empty_like(points)
     tracks[problem.order] = points
     tracks[~reconstruction.track_estimated] = np.nan

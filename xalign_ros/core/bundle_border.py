@@ -8,6 +8,7 @@ import numpy as np
 
 from xalign_ros.core.bundle_layout import Block, Chunk
 from xalign_ros.core.bundle_observations import Linearized
+from xalign_ros.core.bundle_tracks import Tangent
 from xalign_ros.core.lie import Array
 
 
@@ -17,7 +18,8 @@ class Border:
     def __init__(self, column: np.ndarray, width: int, count: int, nodes: int) -> None:
         self.column, self.width, self.count, self.nodes = column, width, count, nodes
 
-    def build(self, at: Linearized, blocks: tuple[Block, ...]) -> None:
+    def build(self, at: Linearized, blocks: tuple[Block, ...], s: Array | None) -> None:
+        """s (M,) of bundle_tracks.Tangent, None for one."""
         self._at, self._H = at, np.zeros((6, self.nodes + 1, self.count))
         for block in blocks if self.width else ():
             N, d = at.N[:, :, block.rows], at.D[:, block.rows]
@@ -26,7 +28,7 @@ class Border:
                 n = N[:, k]
                 rows = [d[(a + 2) % 3] * n[(a + 1) % 3] - d[(a + 1) % 3] * n[(a + 2) % 3] for a in range(3)]
                 index = block.local * self.count + self.column[block.rows] + k
-                for a, values in enumerate((*rows, *-n)):
+                for a, values in enumerate((*rows, *-(n if s is None else s[block.rows] * n))):
                     self._H[a, block.nodes] += self._summed(index, values, size).reshape(-1, self.count)
 
     def _summed(self, index: np.ndarray, values: Array, size: int) -> Array:
@@ -37,7 +39,7 @@ class Border:
         self.E, self.F, self.g = self._H.copy(), self._at.F.copy(), -self._at.f
         self.F[np.diag_indices(self.count)] *= 1 + damping
 
-    def eliminate(self, block: Block, chunk: Chunk, L: Array, B: Array, zg: Array) -> None:
+    def eliminate(self, block: Block, chunk: Chunk, L: Array, B: Array, zg: Array, tangent: Tangent | None) -> None:
         """A chunk with its matrix B (3 tracks, 6 n), where L (6, m) are the factors of the block's observations."""
         tracks, n = chunk.tracks.stop - chunk.tracks.start, len(chunk.nodes)
         rows = slice(chunk.rows.start - block.rows.start, chunk.rows.stop - block.rows.start)
@@ -45,7 +47,7 @@ class Border:
         index = chunk.at // (6 * n) * self.count + self.column[chunk.rows]
         C = np.zeros((3, tracks, self.count))
         for k in range(self.width):
-            x, y, z = N[:, k]
+            x, y, z = N[:, k] if tangent is None else tangent.down(N[:, k], chunk.rows)
             whitened = (L[0] * x, L[1] * x + L[2] * y, L[3] * x + L[4] * y + L[5] * z)
             for c, values in enumerate(whitened):
                 C[c] += self._summed(index + k, values, size).reshape(tracks, self.count)

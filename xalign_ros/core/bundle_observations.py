@@ -1,7 +1,8 @@
 """Reprojections of bundle adjustment: their cost, and what the normal equations need of them, block by block.
 
-A perturbation [w, u] of a view takes R to Exp(w) R and t to t + u. With D = X - t the camera's point R^T D then moves by
-R^T (dX - u + D x w), so that of each observation a symmetric matrix (3, 3), a vector (3,) and D say everything.
+A perturbation [w, u] of a view takes R to Exp(w) R and t to t + u. The camera's point R^T D, with D of bundle_tracks, then
+moves by R^T (P x - s u + D x w), x the step of the track; so of each observation a symmetric matrix (3, 3), a vector (3,),
+D, and P and s where they are not 1, say everything.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 
 from xalign_ros.core.bundle_intrinsics import Intrinsics
 from xalign_ros.core.bundle_layout import BLOCK
+from xalign_ros.core.bundle_tracks import Bearings, Points
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.graph_losses import weigh
 from xalign_ros.core.lie import Array
@@ -23,8 +25,8 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linearized:
-    """Of M observations: A (6, M), the upper triangle of J^T J, and a (3, M) = J^T r, with J (2, 3) the Jacobian to the
-    world's point of a whitened and reweighted residual r (2,); D (3, M) = X - t. Zeros where there is no projection.
+    """Of M observations: A (6, M), the upper triangle of J^T J, and a (3, M) = J^T r, with J (2, 3) the Jacobian to D
+    (3, M) of a whitened and reweighted residual r (2,). A and a are zero where there is no projection.
 
     cost is half the sum of squares, or that of the loss; lost (M,) says which have no projection. With J_c (2, q) the
     Jacobian to the q refined intrinsics of its camera: N (3, q, M) = J^T J_c, and of all intrinsics the sums of J_c^T J_c
@@ -76,19 +78,19 @@ class Observations:
     def __len__(self) -> int:
         return len(self.view)
 
-    def at(self, R: Array, t: Array, X: Array, cameras: tuple[Camera, ...]) -> Linearized:
-        """Of poses T_world_cam, R (V, 3, 3), t (V, 3), and points X (P, 3), seen by cameras.
+    def at(self, R: Array, t: Array, tracks: Points | Bearings, cameras: tuple[Camera, ...]) -> Linearized:
+        """Of poses T_world_cam, R (V, 3, 3), t (V, 3), and P tracks, seen by cameras.
 
         An observation without a projection costs as much as one at the image's other end.
         """
         m = len(self)
         A, a, D, lost, cost = np.empty((6, m)), np.empty((3, m)), np.empty((3, m)), np.empty(m, bool), 0.0
-        R, t, X = (np.ascontiguousarray(x.reshape(len(x), n).T) for x, n in ((R, 9), (t, 3), (X, 3)))
+        R, towards = np.ascontiguousarray(R.reshape(len(R), 9).T), tracks.towards(t)
         q, Q_all = self.intrinsics.width, self.intrinsics.count
         N, F, f = np.empty((3, q, m if q else 0)), np.zeros((Q_all, Q_all)), np.zeros(Q_all)
         for part, by_camera in self._blocks:
             view = self.view[part]
-            D[:, part] = d = X.take(self.track[part], axis=1) - t.take(view, axis=1)
+            D[:, part] = d = towards(view, self.track[part])
             Q = R.take(view, axis=1)
             x = np.stack([Q[k] * d[0] + Q[k + 3] * d[1] + Q[k + 6] * d[2] for k in range(3)], axis=1)
             r, J = np.empty((2, len(view))), np.empty((2, 3, len(view)))
@@ -131,9 +133,12 @@ class Observations:
         return Linearized(A, a, D, float(cost), lost, N, F, f)
 
     def placed(
-        self, R: Array, t: Array, X: Array, cameras: tuple[Camera, ...], lost: np.ndarray, free: np.ndarray
-    ) -> Array:
-        """Points X (P, 3) with the free ones of lost (M,) observations where the rays of all of theirs pass nearest."""
+        self, R: Array, t: Array, cameras: tuple[Camera, ...], lost: np.ndarray, free: np.ndarray
+    ) -> tuple[np.ndarray, Array]:
+        """Of lost (M,) observations the free tracks (K,), and the points (K, 3) where the rays of all of theirs pass nearest.
+
+        Tracks of parallel rays are left out.
+        """
         tracks = np.unique(self.track[lost])
         tracks = tracks[free[tracks]]
         rows = np.flatnonzero(np.isin(self.track, tracks))
@@ -150,6 +155,4 @@ class Observations:
         np.add.at(N, at, across)
         np.add.at(b, at, np.einsum("mij,mj->mi", across, t[view]))
         good = np.linalg.eigvalsh(N)[:, 0] > PARALLEL if len(N) else np.zeros(0, bool)
-        out = X.copy()
-        out[tracks[good]] = np.linalg.solve(N[good], b[good][..., None])[..., 0]
-        return out
+        return tracks[good], np.linalg.solve(N[good], b[good][..., None])[..., 0]

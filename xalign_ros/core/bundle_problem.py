@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,21 +11,22 @@ from xalign_ros.core.bundle_factors import Linear, PoseEdges, edges_at, gravity_
 from xalign_ros.core.bundle_intrinsics import Intrinsics
 from xalign_ros.core.bundle_observations import Linearized, Observations
 from xalign_ros.core.bundle_system import Reduced
+from xalign_ros.core.bundle_tracks import Bearings, Points
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.graph_band import SingularError
 from xalign_ros.core.graph_losses import Stage, weigh
-from xalign_ros.core.lie import Array, so3_exp
+from xalign_ros.core.lie import Array, project_rotation, so3_exp
 from xalign_ros.core.pose_graph import Loss
 from xalign_ros.core.reconstruction import Reconstruction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Poses T_world_cam, R (V, 3, 3), t (V, 3), points X (P, 3) in the problem's order, cameras, all residuals there."""
+    """Poses T_world_cam, R (V, 3, 3), t (V, 3), tracks in the problem's order, cameras, all residuals there."""
 
     R: Array
     t: Array
-    X: Array
+    tracks: Points | Bearings
     cameras: tuple[Camera, ...]
     reprojections: Linearized
     others: list[tuple[Linear, Stage]]
@@ -46,6 +47,7 @@ class Problem:
         down_world: Sequence[float],
         gravity_as_cross: bool,
         refined: Collection[str] = (),
+        inverse_depth: bool = False,
     ) -> None:
         v, p = len(r.view_ids), len(r.track_ids)
         free_views = r.estimated & ~(np.zeros(v, bool) if constant_views is None else constant_views)
@@ -77,15 +79,15 @@ class Problem:
         if len(rows) and (camera[r.observing_views[rows]] < 0).any():
             bad = r.observing_views[rows][camera[r.observing_views[rows]] < 0][0]
             raise ValueError(f"view {r.view_ids[bad]} has observations but no camera")
-        self.free_tracks, X = free_tracks[self.order], r.points[self.order]
+        self.free_tracks, self._r = free_tracks[self.order], r
         self.intrinsics = Intrinsics(r.cameras, np.unique(camera[r.observing_views[rows]]), refined)
         self.observations = self._of(r, rows, track, camera)
-        self.start = self.at(r.R, r.t, X, r.cameras)
+        self.start = self.at(r.R, r.t, self._tracks(r, inverse_depth), r.cameras)
         lost = self.start.reprojections.lost
         self.skipped = int(lost.sum())
         if self.skipped:
             self.observations = self._of(r, rows[~lost], track, camera)
-            self.start = self.at(r.R, r.t, X, r.cameras)
+            self.start = self.at(r.R, r.t, self._tracks(r, inverse_depth), r.cameras)
         ends = [[e.i, e.j] for e in edges] + [[x.views] for x in (r.priors, r.gravity) if x is not None]
         o = self.observations
         self.system = Reduced(o.view, o.track, self.free_tracks, free_views, ends, o.column, self.intrinsics)
@@ -95,12 +97,51 @@ class Problem:
         size_px = np.array([(c.width, c.height) for c in r.cameras], float).reshape(-1, 2)
         return Observations(view, track[rows], r.uv[rows], sigma_px, camera[view], self.intrinsics, size_px, self.loss)
 
-    def at(self, R: Array, t: Array, X: Array, cameras: tuple[Camera, ...]) -> State:
+    def _tracks(self, r: Reconstruction, inverse_depth: bool) -> Points | Bearings:
+        """In the problem's order; a track's reference view is the first that sees it."""
+        infinite = np.zeros(len(self.order), bool) if r.at_infinity is None else r.at_infinity[self.order]
+        if not inverse_depth:
+            bad = infinite & r.track_estimated[self.order]
+            if bad.any():
+                what = f"track {r.track_ids[self.order[bad.argmax()]]} is at infinity"
+                raise ValueError(f"{what}, which is no point; inverse depths can tell it")
+            return Points(r.points[self.order])
+        view, track, p = self.observations.view, self.observations.track, len(self.order)
+        reference, length = np.zeros(p, np.int64), np.zeros(p)
+        reference[track[::-1]] = view[::-1]
+        np.maximum.at(length, track, np.linalg.norm(r.t[view] - r.t[reference[track]], axis=1))
+        length[length == 0] = 1.0
+        return Bearings.of(r.points[self.order], infinite, reference, length, r.t)
+
+    def told(self, at: State) -> Reconstruction:
+        """The reconstruction at a state; what did not move is as it was."""
+        r, moved = self._r, np.zeros(len(self.order), bool)
+        moved[self.order] = self.free_tracks & (np.bincount(self.observations.track, minlength=len(self.order)) > 0)
+        points, infinite = (np.empty_like(x) for x in at.tracks.told(at.t))
+        points[self.order], infinite[self.order] = at.tracks.told(at.t)
+        before = np.zeros(len(moved), bool) if r.at_infinity is None else r.at_infinity
+        infinite = np.where(moved, infinite, before)
+        return replace(
+            r,
+            R=project_rotation(at.R),
+            t=at.t,
+            points=np.where(moved[:, None], points, r.points),
+            at_infinity=infinite if infinite.any() else None,
+            cameras=at.cameras,
+        )
+
+    def at(self, R: Array, t: Array, tracks: Points | Bearings, cameras: tuple[Camera, ...]) -> State:
         """The residuals of a state; its cost is infinite where it is not a number."""
-        reprojections = self.observations.at(R, t, X, cameras)
+        reprojections = self.observations.at(R, t, tracks, cameras)
         others = [(linear, (loss, np.inf)) for linear, loss in self._others(R, t)]
         cost = reprojections.cost + sum(_cost(r, stage) for (r, _), stage in others)
-        return State(R, t, X, cameras, reprojections, others, cost if np.isfinite(cost) else np.inf)
+        return State(R, t, tracks, cameras, reprojections, others, cost if np.isfinite(cost) else np.inf)
+
+    def build(self, at: State) -> None:
+        """The normal equations at a state."""
+        o, bearings = self.observations, at.tracks if isinstance(at.tracks, Bearings) else None
+        far = None if bearings is None else bearings.rho == 0
+        self.system.build(at.reprojections, at.others, at.R, at.tracks.tangent(o.view, o.track, at.t), far)
 
     def stepped(self, at: State, damping: float) -> State | None:
         """The state after one damped step, or None where the system is singular.
@@ -114,11 +155,14 @@ class Problem:
             cameras = self.intrinsics.stepped(at.cameras, inner)
         except (SingularError, ValueError):  # the latter is of intrinsics that no camera has
             return None
-        there = self.at(so3_exp(views[:, :3]) @ at.R, at.t + views[:, 3:], at.X + points, cameras)
+        t = at.t + views[:, 3:]
+        there = self.at(
+            so3_exp(views[:, :3]) @ at.R, t, at.tracks.moved(points, views, at.t, self.free_tracks), cameras
+        )
         lost = there.reprojections.lost
         if lost.any() and np.isfinite(there.cost):
-            X = self.observations.placed(there.R, there.t, there.X, cameras, lost, self.free_tracks)
-            again = self.at(there.R, there.t, X, cameras)
+            placed = self.observations.placed(there.R, t, cameras, lost, self.free_tracks)
+            again = self.at(there.R, t, there.tracks.put(*placed, t), cameras)
             return again if again.cost < there.cost else there
         return there
 

@@ -1,6 +1,6 @@
 """The normal equations of bundle adjustment with the points eliminated (Schur complement), banded or multifrontal.
 
-Perturbations of views are those of bundle_observations; the block of a view and a point is W = [hat(D)^T A; -A].
+Perturbations of views are those of bundle_observations; the block of a view and a track is W = [hat(D)^T A; -s A] P.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from xalign_ros.core.bundle_border import Border
 from xalign_ros.core.bundle_factors import Linear
 from xalign_ros.core.bundle_intrinsics import Intrinsics
 from xalign_ros.core.bundle_layout import TRIANGLE, Block, Chunk, Layout, Ties
-from xalign_ros.core.bundle_observations import Linearized
+from xalign_ros.core.bundle_observations import UPPER, Linearized
+from xalign_ros.core.bundle_tracks import Tangent
 from xalign_ros.core.graph_band import SingularError
 from xalign_ros.core.graph_losses import Stage, weigh
 from xalign_ros.core.graph_system import Scatter
@@ -24,6 +25,7 @@ LEAST = 1e-12  # of a point's curvature, as a part of the largest
 FREE = 1e-11  # a pivot that so little is left of is rounding
 UNKNOWN = 1e-10  # curvature of a direction of a point, as a part of the largest, that says nothing
 ROWS, COLUMNS = np.tril_indices(3)
+ALL = slice(None)
 SYMMETRIC = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # rows of a symmetric matrix of which six numbers are kept
 
 
@@ -51,20 +53,35 @@ class Reduced:
         self.node, self.count = self._layout.node, self._layout.count
         self._border = Border(column, intrinsics.width, intrinsics.count, self.count)
 
-    def build(self, at: Linearized, others: Sequence[tuple[Linear, Stage]], R: Array) -> None:
-        """Of observations and other factors at poses with rotations R (V, 3, 3)."""
-        self._at = at
-        self._border.build(at, self._layout.blocks)
+    def build(
+        self,
+        at: Linearized,
+        others: Sequence[tuple[Linear, Stage]],
+        R: Array,
+        tangent: Tangent | None = None,
+        far: np.ndarray | None = None,
+    ) -> None:
+        """Of observations and other factors at poses with rotations R (V, 3, 3).
+
+        far (P,): tracks at infinity. One that would go beyond stays there: its third number does not move.
+        """
+        self._at, self._tangent = at, tangent
+        self._border.build(at, self._layout.blocks, None if tangent is None else tangent.s)
         H = np.zeros((27, self.count + 1))
         for block in self._layout.blocks:
             A, a, d = at.A[:, block.rows], at.a[:, block.rows], at.D[:, block.rows]
-            for n, values in enumerate(_of_view(A, a, d)):
+            for n, values in enumerate(_of_view(A, a, d, None if tangent is None else tangent.s[block.rows])):
                 H[n, block.nodes] += np.bincount(block.local, values, len(block.nodes))
         self.H, self.g = H[:21, : self.count].T, np.ascontiguousarray(H[21:, : self.count].T)
         self.h, self.gx = np.zeros((6, len(self.free))), np.zeros((3, len(self.free)))
+        A, a = (at.A, at.a) if tangent is None else (_squared(at.A, tangent.P), tangent.down(at.a, ALL))
         if len(self._seen):
-            self.h[:, self._seen] = np.add.reduceat(at.A, self._start[self._seen], axis=1)
-            self.gx[:, self._seen] = np.add.reduceat(at.a, self._start[self._seen], axis=1)
+            self.h[:, self._seen] = np.add.reduceat(A, self._start[self._seen], axis=1)
+            self.gx[:, self._seen] = np.add.reduceat(a, self._start[self._seen], axis=1)
+        if tangent is not None and far is not None:
+            stay = far & (self.gx[2] > 0)
+            tangent.P[:, 2, stay[self.track]] = 0.0
+            self.h[np.ix_([2, 4, 5], stay)] = self.gx[2, stay] = 0.0
         self._tied: list[tuple[Scatter, Array]] = []
         for ties, (linear, stage) in zip(self._layout.ties, others, strict=True):
             self._tie(ties, linear, stage, R)
@@ -104,7 +121,7 @@ class Reduced:
         for block, chunk, B, factors in self._whitened() if self.count or border.count else ():
             n = len(chunk.nodes)
             if border.count:
-                border.eliminate(block, chunk, factors, B, zg[:, chunk.tracks].reshape(-1))
+                border.eliminate(block, chunk, factors, B, zg[:, chunk.tracks].reshape(-1), self._tangent)
             blocks[chunk.pair] += (B.T @ B).reshape(6, n, 6, n)[:, chunk.row, :, chunk.column].reshape(-1, 36)
             rhs[chunk.nodes] += (zg[:, chunk.tracks].reshape(-1) @ B).reshape(6, n).T
         self._layout.subtract(blocks)
@@ -114,7 +131,7 @@ class Reduced:
         for block in self._layout.blocks:
             at = block.rows
             factors = self.L.take(self.track[at], axis=1)
-            Z = _whitened(self._at.A[:, at], self._at.D[:, at], factors)
+            Z = _whitened(self._at.A[:, at], self._at.D[:, at], factors, self._tangent, at)
             for chunk in block.chunks:
                 n, tracks = len(chunk.nodes), chunk.tracks.stop - chunk.tracks.start
                 rows = slice(chunk.rows.start - at.start, chunk.rows.stop - at.start)
@@ -141,11 +158,15 @@ class Reduced:
         for block in self._layout.blocks:
             A, d = self._at.A[:, block.rows], self._at.D[:, block.rows]
             w = moved.take(self.view[block.rows], axis=1)
+            if self._tangent is not None:
+                w[3:] *= self._tangent.s[block.rows]
             e = [d[1] * w[2] - d[2] * w[1] - w[3], d[2] * w[0] - d[0] * w[2] - w[4], d[0] * w[1] - d[1] * w[0] - w[5]]
             for n, row in enumerate(SYMMETRIC):
                 along[n, block.rows] = A[row[0]] * e[0] + A[row[1]] * e[1] + A[row[2]] * e[2]
             if self._border.count:
                 along[:, block.rows] += self._border.moved(inner, block.rows)
+        if self._tangent is not None:
+            along = self._tangent.down(along, ALL)
         g = self.gx.copy()
         if len(self._seen):
             g[:, self._seen] += np.add.reduceat(along, self._start[self._seen], axis=1)
@@ -229,24 +250,36 @@ def _lower(L: Array, g: Array) -> tuple[Array, Array, Array]:
     return L[0] * g[0], L[1] * g[0] + L[2] * g[1], L[3] * g[0] + L[4] * g[1] + L[5] * g[2]
 
 
-def _of_view(A: Array, a: Array, d: Array) -> Iterator[Array]:
+def _squared(A: Array, P: Array) -> Array:
+    """Upper triangle (6, M) of P^T A P."""
+    Q = [[A[row[0]] * P[0, c] + A[row[1]] * P[1, c] + A[row[2]] * P[2, c] for row in SYMMETRIC] for c in range(3)]
+    return np.stack([P[0, i] * Q[j][0] + P[1, i] * Q[j][1] + P[2, i] * Q[j][2] for i, j in UPPER])
+
+
+def _of_view(A: Array, a: Array, d: Array, s: Array | None) -> Iterator[Array]:
     """Lower triangle (21) of the block of a view, row by row, and its gradient (6), of each observation."""
     B = _turned(A, d)
+    C, T, b = (B, A, a) if s is None else (_turned(s * A, d), s * s * A, s * a)
     for n in range(3):
         for k in range(n + 1):
             yield B[n][(k + 1) % 3] * d[(k + 2) % 3] - B[n][(k + 2) % 3] * d[(k + 1) % 3]
     for n, row in enumerate(((0,), (1, 3), (2, 4, 5))):
-        yield from (-B[k][n] for k in range(3))
-        yield from (A[k] for k in row)
+        yield from (-C[k][n] for k in range(3))
+        yield from (T[k] for k in row)
     for n in range(3):
         yield a[(n + 1) % 3] * d[(n + 2) % 3] - a[(n + 2) % 3] * d[(n + 1) % 3]
-    yield from (-x for x in a)
+    yield from (-x for x in b)
 
 
-def _whitened(A: Array, d: Array, L: Array) -> tuple[list[Array], list[Array], list[Array]]:
+def _whitened(
+    A: Array, d: Array, L: Array, tangent: Tangent | None, rows: slice
+) -> tuple[list[Array], list[Array], list[Array]]:
     """W L^T of each observation: three columns, each of six numbers."""
-    B = _turned(A, d)
-    p, q, s = ([B[0][k], B[1][k], B[2][k], *(-A[n] for n in row)] for k, row in enumerate(SYMMETRIC))
+    B, T = _turned(A, d), A if tangent is None else tangent.s[rows] * A
+    p, q, s = ([B[0][k], B[1][k], B[2][k], *(-T[n] for n in row)] for k, row in enumerate(SYMMETRIC))
+    if tangent is not None:
+        P = tangent.P[:, :, rows]
+        p, q, s = ([P[0, c] * x + P[1, c] * y + P[2, c] * z for x, y, z in zip(p, q, s, strict=True)] for c in range(3))
     return (
         [L[0] * x for x in p],
         [L[1] * x + L[2] * y for x, y in zip(p, q, strict=True)],

@@ -59,8 +59,9 @@ class Reconstruction:
     None; camera (V,) into `cameras`, -1 where a view has none. Tracks: track_ids (P,), points (P, 3), good where
     track_estimated (P,); track p is observed by views observing_views[offsets[p] : offsets[p + 1]] (rows), its reference
     view first, at uv (M, 2) px with standard deviations sigma_px (M, 2), None = 1. colours (P, 3) uint8 and descriptors
-    (P, D) float32, NaN rows where a track has none, are None where no track has any. Raises ValueError on shapes, ids
-    named twice, rows that are not there and numbers that are not finite.
+    (P, D) float32, NaN rows where a track has none, are None where no track has any. at_infinity (P,): tracks whose row
+    of `points` is a direction in the world, None where there are none. Raises ValueError on shapes, ids named twice, rows
+    that are not there and numbers that are not finite.
     """
 
     view_ids: np.ndarray
@@ -82,6 +83,7 @@ class Reconstruction:
     sigma_px: Array | None = None
     colours: np.ndarray | None = None
     descriptors: np.ndarray | None = None
+    at_infinity: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         put, v, p, m = object.__setattr__, len(self.view_ids), len(self.track_ids), len(self.observing_views)
@@ -102,6 +104,7 @@ class Reconstruction:
             "camera": ((v,), np.int64),
             "sigma_px": ((m, 2), np.float64),
             "colours": ((p, 3), np.uint8),
+            "at_infinity": ((p,), np.bool_),
         }
         shapes |= {name: shape for name, shape in optional.items() if getattr(self, name) is not None}
         for name, (shape, dtype) in shapes.items():

@@ -32,12 +32,18 @@ SHARE = 0.5  # of an anchor's information goes to its prior, the other half to t
 
 
 def bundled(
-    aligned: AlignedRun, run: Reconstruction, keyframes: Mapping[int, Keyframe], index: MapIndex, config: Config
+    aligned: AlignedRun,
+    run: Reconstruction,
+    keyframes: Mapping[int, Keyframe],
+    index: MapIndex,
+    config: Config,
+    *,
+    inverse_depth: bool = False,
 ) -> tuple[Bundled, int]:
     """What bundle adjustment makes of the aligned run, without the segment's points, and how many of those there were.
 
-    `run` is the reconstruction before it was aligned, `keyframes` by row as align_run had them. Raises ValueError on a
-    view that has observations but no camera.
+    `run` is the reconstruction before it was aligned, `keyframes` by row as align_run had them; inverse_depth is adjust's.
+    Raises ValueError on a view that has observations but no camera.
     """
     whole, count = with_segment(retriangulated(aligned.reconstruction), aligned.anchors, keyframes, index, config)
     own = len(run.track_ids)
@@ -50,9 +56,17 @@ def bundled(
         constant_tracks=constant,
         loss=HUBER,
         prior_loss=PRIOR_LOSS,
+        inverse_depth=inverse_depth,
     )
     r = done.reconstruction
-    back = replace(aligned.reconstruction, R=r.R, t=r.t, points=r.points[:own], track_estimated=r.track_estimated[:own])
+    back = replace(
+        aligned.reconstruction,
+        R=r.R,
+        t=r.t,
+        points=r.points[:own],
+        track_estimated=r.track_estimated[:own],
+        at_infinity=None if r.at_infinity is None else r.at_infinity[:own],
+    )
     return replace(done, reconstruction=back), count
 
 
@@ -120,6 +134,7 @@ def with_segment(
         sigma_px=np.vstack([own, np.repeat(sigma[order, None], 2, axis=1)]),
         colours=None,
         descriptors=None,
+        at_infinity=None,
     ), n
 
 

@@ -60,7 +60,8 @@ class _Tracks:
 def read_pytheia(path: str | Path) -> Reconstruction:
     """Views and tracks by rising id; the observations are the features of the views.
 
-    A track is estimated where pyTheia says so and its point is not at infinity. A view's prior of an orientation counts
+    A track is estimated where pyTheia says so and its point is not at infinity; one at infinity has its direction in
+    `points` and is marked in at_infinity. A view's prior of an orientation counts
     where its flag is exactly 1: pyTheia leaves it uninitialised. stamps_ns is None where a time is negative, pyTheia's
     "none". Only a view without an estimated pose may be without a usable camera. Raises MapError, with the byte, on a
     file that is damaged, none, has rigs or a camera that has no counterpart here.
@@ -186,6 +187,8 @@ def _reconstruction(views: dict[int, _View], tracks: _Tracks) -> Reconstruction:
     R = np.swapaxes(so3_exp(extrinsics[:, 3:]), 1, 2)
     points = np.array(tracks.points).reshape(-1, 4)[order]
     finite = points[:, 3] != 0
+    told = np.array(tracks.estimated, bool)[order]
+    infinite = told & ~finite & points[:, :3].any(axis=1)
     cameras, camera = _cameras(seen)
     colours = np.array(tracks.colours, np.uint8).reshape(-1, 3)[order]
     return Reconstruction(
@@ -195,8 +198,13 @@ def _reconstruction(views: dict[int, _View], tracks: _Tracks) -> Reconstruction:
         extrinsics[:, :3],
         np.array([v.estimated for v in seen], bool),
         track_ids,
-        np.divide(points[:, :3], points[:, 3:], out=np.zeros((len(points), 3)), where=finite[:, None]),
-        np.array(tracks.estimated, bool)[order] & finite,
+        np.divide(
+            points[:, :3],
+            np.where(finite, points[:, 3], np.linalg.norm(points[:, :3], axis=1))[:, None],
+            out=np.zeros((len(points), 3)),
+            where=(finite | infinite)[:, None],
+        ),
+        told & finite,
         np.r_[0, np.cumsum(np.bincount(track, minlength=len(track_ids)))],
         at,
         features["uv"],
@@ -208,6 +216,7 @@ def _reconstruction(views: dict[int, _View], tracks: _Tracks) -> Reconstruction:
         sigma_px if (sigma_px != 1).any() else None,
         colours if colours.any() else None,
         _descriptors([tracks.descriptors[k] for k in order]),
+        infinite if infinite.any() else None,
     )
 
 

@@ -30,8 +30,9 @@ MAX_ID = 2**32 - 2  # the last is pyTheia's "none"
 def write_pytheia(reconstruction: Reconstruction, path: str | Path) -> None:
     """A file that pytheia's ReadReconstruction takes; views of one camera share their intrinsics.
 
-    The inverse depths and bearings are those of the reference views. The file gets its name when it is complete. Raises
-    MapError on ids, names or cameras that pyTheia cannot hold, and where the disk refuses.
+    The inverse depths and bearings are those of the reference views; a track at infinity has the fourth coordinate 0. The
+    file gets its name when it is complete. Raises MapError on ids, names or cameras that pyTheia cannot hold, and where
+    the disk refuses.
     """
     path, r, w = Path(path), reconstruction, Writer()
     for what, ids in (("view", r.view_ids), ("track", r.track_ids)):
@@ -171,6 +172,7 @@ def _write_tracks(w: Writer, r: Reconstruction) -> None:
     view_ids, offsets = r.view_ids[r.observing_views].tolist(), r.offsets.tolist()
     reference, inverse_depth, bearing = _reference(r)
     colours = np.zeros((len(r.track_ids), 3), np.uint8) if r.colours is None else r.colours
+    infinite = np.zeros(len(r.track_ids), bool) if r.at_infinity is None else r.at_infinity
     none: np.ndarray = np.full((len(r.track_ids), 0), np.nan, np.float32)
     descriptors = none if r.descriptors is None else r.descriptors
     has_descriptor: np.ndarray = np.isfinite(descriptors).all(axis=1)
@@ -179,9 +181,12 @@ def _write_tracks(w: Writer, r: Reconstruction) -> None:
         w.put("I", track_id)
         w.version("Track")
         seen = sorted(set(view_ids[offsets[p] : offsets[p + 1]]))
-        w.put(f"?Q{len(seen)}I", r.track_estimated[p], len(seen), *seen)
+        w.put(f"?Q{len(seen)}I", r.track_estimated[p] or infinite[p], len(seen), *seen)
         descriptor = descriptors[p][: descriptors.shape[1] if has_descriptor[p] else 0]
-        head = *(reference[p], inverse_depth[p], 4, 1, *r.points[p], 1.0), *(3, 1, *colours[p].tolist())
+        head = (
+            *(reference[p], inverse_depth[p], 4, 1, *r.points[p], float(not infinite[p])),
+            *(3, 1, *colours[p].tolist()),
+        )
         w.put(TRACK_TAIL, *head, 3, 1, *bearing[p], len(descriptor), 1)
         w.parts.append(descriptor.astype("<f4").tobytes())
 
@@ -196,6 +201,8 @@ def _reference(r: Reconstruction) -> tuple[list[int], Array, Array]:
         return [0] * len(seen), inverse_depth, bearing
     depth = np.einsum("pi,pi->p", r.R[view][:, :, 2], r.points - r.t[view])
     good = seen & r.track_estimated & r.estimated[view] & (depth > 0)
+    if r.at_infinity is not None:
+        good &= ~r.at_infinity
     inverse_depth[good] = 1 / depth[good]
     if r.camera is not None:
         for k, camera in enumerate(r.cameras):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from xalign_ros.core.errors import MapError
@@ -73,6 +74,11 @@ def write_reconstruction(
     """
     if not force:
         refuse_existing(path)
+    if reconstruction.at_infinity is not None and (folder or path.suffix in WRITERS):
+        finite = ~reconstruction.at_infinity
+        tell(f"{(~finite).sum()} tracks are at infinity, where only pyTheia's files have points; they are left out")
+        kept = reconstruction.track_estimated & finite
+        reconstruction = replace(reconstruction, track_estimated=kept, at_infinity=None)
     if path.suffix not in WRITERS and folder:
         _write_colmap(reconstruction, path)
     elif path.is_dir():
