@@ -109,7 +109,7 @@ summary = pt.sfm.BundleAdjustReconstructionWithRelativePoseEdges(
 
 
 def test_the_pages_example_runs_verbatim() -> None:
-    """With priors on the first two views alone; what has no counterpart is named once."""
+    """With priors on the first two views alone."""
     run_reconstruction, poses, _ = reconstruction(shaken=0.01)
     for n, (R, c) in enumerate(poses[:2]):
         run_reconstruction.View(n).SetPositionPrior(c, 1000 * np.eye(3))
@@ -118,7 +118,11 @@ def test_the_pages_example_runs_verbatim() -> None:
     exec(EXAMPLE, names)
     summary = names["summary"]
     assert summary.success and summary.final_cost < 1e-6 * summary.initial_cost
-    assert summary.without_counterpart == ("use_inverse_depth_parametrization",)
+    assert summary.without_counterpart == () and summary.skipped == ()
+    track, first = run_reconstruction.Track(0), run_reconstruction.View(0).Camera()
+    x = first.GetOrientationAsRotationMatrix() @ (track.Point()[:3] - first.GetPosition())
+    assert track.ReferenceViewId() == 0 and track.InverseDepth() == pytest.approx(1 / x[2])
+    np.testing.assert_allclose(track.ReferenceBearingVector(), x / x[2])
     assert off(run_reconstruction, poses) < 1e-4
 
 
@@ -145,7 +149,7 @@ def test_edges_beside_constant_views_and_a_part_of_it() -> None:
     partial = pt.sfm.BundleAdjustPartialViewsConstantWithRelativePoseEdges
     assert partial(options, [2, 3, 4, 5], [0, 1], [edge], recon).success and off(recon, poses) < 1e-4
     before = recon.Track(7).Point()
-    pt.sfm.BundleAdjustPartialReconstruction(options, {2, 3}, {1, 2}, reconstruction(shaken=0.01)[0])
+    pt.sfm.BundleAdjustPartialReconstruction(options, {2, 3}, {1, 2}, recon)
     assert (recon.Track(7).Point() == before).all()
 
 

@@ -7,12 +7,14 @@ does.
 from types import SimpleNamespace
 
 from xalign_ros.compat import (
+    pytheia_adjuster,
     pytheia_bundle,
     pytheia_bundle_options,
     pytheia_pose_graph,
     pytheia_priors,
     pytheia_reconstruction,
     pytheia_structs,
+    pytheia_tracks,
     pytheia_views,
 )
 
@@ -20,12 +22,14 @@ sfm = SimpleNamespace(
     **{
         name: getattr(module, name)
         for module in (
+            pytheia_adjuster,
             pytheia_bundle,
             pytheia_bundle_options,
             pytheia_pose_graph,
             pytheia_priors,
             pytheia_reconstruction,
             pytheia_structs,
+            pytheia_tracks,
             pytheia_views,
         )
         for name in module.__all__

@@ -63,7 +63,7 @@ REFINED = {
 USED = {
     *("loss_function_type", "robust_loss_width", "intrinsics_to_optimize", "max_num_iterations", "verbose"),
     *("use_position_priors", "use_orientation_priors", "use_gravity_priors", "gravity_prior_error_type"),
-    "gravity_world_direction",
+    *("gravity_world_direction", "use_inverse_depth_parametrization"),
 }
 
 
@@ -133,7 +133,8 @@ class BundleAdjustmentOptions:
 
 @dataclass(eq=False, slots=True)
 class BundleAdjustmentSummary:
-    """without_counterpart: options that were changed and say nothing here, each once; not in pyTheia's."""
+    """Not in pyTheia's: without_counterpart, options that were changed and say nothing here, each once; skipped, sentences
+    on views and tracks that stay where they are though they were to move."""
 
     success: bool = False
     initial_cost: float = 0.0
@@ -141,3 +142,4 @@ class BundleAdjustmentSummary:
     setup_time_in_seconds: float = 0.0
     solve_time_in_seconds: float = 0.0
     without_counterpart: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()

@@ -32,6 +32,7 @@ class Track:
     def __init__(self) -> None:
         self._point, self._estimated, self._views = np.zeros(4), False, set[int]()
         self.features: dict[int, Feature] = {}  # by view, the reference view first
+        self._inverse_depth, self._bearing, self._reference = 0.0, np.zeros(3), kInvalidViewId
 
     def Point(self) -> Array:
         """Homogeneous (4,); zeros until it is set."""
@@ -47,7 +48,27 @@ class Track:
         self._estimated = bool(estimated)
 
     def AddView(self, view_id: int) -> None:
+        if not self._views:
+            self._reference = int(view_id)
         self._views.add(int(view_id))
+
+    def ReferenceViewId(self) -> int:
+        """The view that was added first."""
+        return self._reference
+
+    def InverseDepth(self) -> float:
+        """1 / z in the reference view, 0 at infinity and where it is not known."""
+        return self._inverse_depth
+
+    def SetInverseDepth(self, inverse_depth: float) -> None:
+        self._inverse_depth = float(inverse_depth)
+
+    def ReferenceBearingVector(self) -> Array:
+        """(3,) with z = 1, of the point in the reference view; zeros where it is not known."""
+        return self._bearing.copy()
+
+    def SetReferenceBearingVector(self, bearing: ArrayLike) -> None:
+        self._bearing = vector(bearing, 3, "a bearing")
 
     def NumViews(self) -> int:
         return len(self._views)
@@ -123,7 +144,19 @@ class Reconstruction:
         return len(self._tracks)
 
     def InitializeInverseDepth(self) -> None:
-        """Nothing to do: bundle adjustment is over points."""
+        """Inverse depths and bearings of estimated tracks as their points and reference views are.
+
+        Bundle adjustment starts from the points, with this or without it, and does it at its end.
+        """
+        for track in self._tracks.values():
+            view = self._views.get(track.ReferenceViewId())
+            if view is None or not (view.IsEstimated() and track.IsEstimated()):
+                continue
+            *X, w = track.Point()
+            x = view.Camera().GetOrientationAsRotationMatrix() @ (X - w * view.Camera().GetPosition())
+            if x[2] > 0:
+                track.SetInverseDepth(w / x[2])
+                track.SetReferenceBearingVector(x / x[2])
 
 
 def Sim3FromRotationTranslationScale(R: ArrayLike, t: ArrayLike, scale: float) -> Array:
