@@ -56,6 +56,7 @@ setup(
             "rich>=13.7,<16",
             "mcap>=1.3,<2",
             "zstandard>=0.22,<1",
+            "isal>=1.7,<2",  # the checksums of MCAP in a sixth of the time that zlib takes
             "lz4>=4,<5",  # mcap and rosbags bring it anyway
             "rosbags==0.11.9",
             "matplotlib>=3.9,<4",

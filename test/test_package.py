@@ -245,7 +245,8 @@ def test_commands():
 
 # Import name -> name in package.xml and of the pip distribution, where they differ. None: rosdep has no key.
 ROSDEP = {
-    name: None for name in ("gtsam", "poselib", "mcap", "zstandard", "lz4", "rosbags", "rich", "dask", "distributed")
+    name: None
+    for name in ("gtsam", "poselib", "mcap", "zstandard", "lz4", "isal", "rosbags", "rich", "dask", "distributed")
 } | {
     "PIL": "python3-pil",
     "cv2": "python3-opencv",

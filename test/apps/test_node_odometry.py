@@ -16,7 +16,7 @@ from xalign_ros.apps.node_odometry import OdometryCorrector, Slew
 from xalign_ros.core.config import Config
 from xalign_ros.core.records import AlignmentState, Estimate, Keyframe, State
 from xalign_ros.core.transforms import SE3, Sim3
-from xalign_ros.io.messages import NO_FEATURES
+from xalign_ros.io.keyframe_fields import NO_FEATURES
 from xalign_ros.io.odometry_message import odometry_pose
 from xalign_ros.io.ros_fields import stamp_of
 

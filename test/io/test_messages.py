@@ -143,7 +143,7 @@ BAD_POSES = [
     ("pose.pose.position.z", float("inf"), "not finite"),
     ("pose.pose.orientation.w", float("nan"), "not finite"),
     ("pose.pose.orientation.w", 3.0, "norm"),
-    ("pose.pose.orientation.w", 1e300, "norm inf"),
+    ("pose.pose.orientation.w", 1e300, "norm 1e+300"),
 ]
 BAD_FEATURES = [
     ("features.uv", np.zeros(13), "bad_pixel", "13 numbers"),

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 
 from xalign_ros.core.aligner import Aligner
 from xalign_ros.core.config import Config
@@ -21,7 +21,8 @@ from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.io.adapter import Frame, keyframe_from_frame
 from xalign_ros.io.adapter_log import extractor_for
-from xalign_ros.io.messages import KEYFRAME, NO_FEATURES, keyframe_from_message
+from xalign_ros.io.keyframe_cdr import keyframe_fields_from_cdr
+from xalign_ros.io.keyframe_fields import NO_FEATURES, keyframe_of
 from xalign_ros.io.ros_fields import covariance_from_ros, ros_types
 from xalign_ros.io.step_messages import step_messages
 from xalign_ros.io.view_messages import VIEWS, jump_message, map_points_message, markers_message, path_message
@@ -78,7 +79,6 @@ class Alignment:
         self.map, self._terms = map_, terms
         self._extract = extractor_for(map_, terms.features) if terms.images else None
         self.map_frame = terms.frame_prefix + (terms.map_frame or map_.frame)
-        self._keyframe_type = ros_types(KEYFRAME)
         self._odom_frame, self._cam_frame = "odom", ""
         self.restart("no keyframe was received yet")
 
@@ -120,10 +120,10 @@ class Alignment:
                 assert self._extract is not None
                 keyframe, fault = keyframe_from_frame(data, self._extract)
             else:
-                keyframe, fault = keyframe_from_message(deserialize_message(data, self._keyframe_type))
+                keyframe, fault = keyframe_of(keyframe_fields_from_cdr(data))
         except XalignError as error:
             return self._answer(refused=("no_features", str(error)))
-        except Exception as error:  # of foreign bytes; what they make a deserializer raise has no list
+        except Exception as error:  # of foreign bytes, and of images what they make a decoder raise
             return self._answer(refused=("unreadable", f"a message of {len(data)} bytes: {error}"))
         if keyframe is not None:
             self._odom_frame, self._cam_frame = keyframe.odom_frame, keyframe.cam_frame

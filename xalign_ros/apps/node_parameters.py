@@ -19,7 +19,7 @@ from xalign_ros.core.errors import ConfigError
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io.adapter import SourceOptions
 from xalign_ros.io.camera_file import read_camera
-from xalign_ros.io.messages import QUAT_TOLERANCE
+from xalign_ros.io.keyframe_fields import QUAT_TOLERANCE
 from xalign_ros.io.ros_fields import ros_types
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)

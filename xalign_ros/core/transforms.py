@@ -14,11 +14,15 @@ from xalign_ros.core.lie import Array
 
 def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: DTypeLike = np.float64) -> np.ndarray:
     """A read-only array of the asked shape (None = any length). Raises ValueError naming the field otherwise."""
-    a: np.ndarray = np.array(value, dtype=dtype)
-    if a.shape != shape and (
-        a.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, a.shape, strict=True))
-    ):
-        raise ValueError(f"{name} has shape {a.shape}, needed is {tuple('N' if n is None else n for n in shape)}")
+    a: np.ndarray = np.array(value, dtype)
+    if a.shape != shape:
+        fits = len(a.shape) == len(shape)
+        for n, wanted in zip(a.shape, shape, strict=False):  # a generator would take longer than all the rest
+            if n != wanted and wanted is not None:
+                fits = False
+        if not fits:
+            told = tuple("N" if n is None else n for n in shape)
+            raise ValueError(f"{name} has shape {a.shape}, needed is {told}")
     a.setflags(write=False)
     return a
 

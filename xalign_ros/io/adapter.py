@@ -35,7 +35,7 @@ from xalign_ros.core.transforms import SE3
 from xalign_ros.io import ros_fields as ros
 from xalign_ros.io.frame_messages import TF, StaticTree
 from xalign_ros.io.image_message import COMPRESSED, IMAGE, RawImage, pixels, raw_image
-from xalign_ros.io.messages import NO_FEATURES
+from xalign_ros.io.keyframe_fields import NO_FEATURES
 from xalign_ros.io.odometry_message import ODOMETRY, odometry_pose
 from xalign_ros.io.source_points import POINTS, SeenPoints, disagreement, points_from_message, positions
 

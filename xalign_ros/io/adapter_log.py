@@ -21,9 +21,10 @@ from xalign_ros.io.camera_file import read_camera
 from xalign_ros.io.frame_messages import TF
 from xalign_ros.io.image_message import COMPRESSED, IMAGE
 from xalign_ros.io.images import extractor
+from xalign_ros.io.keyframe_fields import QUAT_TOLERANCE
 from xalign_ros.io.log import Log, Topic
 from xalign_ros.io.log_files import translated
-from xalign_ros.io.messages import KEYFRAME, QUAT_TOLERANCE
+from xalign_ros.io.messages import KEYFRAME
 from xalign_ros.io.odometry_message import ODOMETRY
 
 OUTPUTS = ("odometry_corrected", "odometry_smooth", "odometry_scaled")  # of the live node

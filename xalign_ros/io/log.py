@@ -21,10 +21,12 @@ from rosbags.typesys.store import Typestore
 
 from xalign_ros.core.errors import LogError, XalignError
 from xalign_ros.core.records import Keyframe, Rejection
+from xalign_ros.io.keyframe_cdr import keyframe_fields_from_cdr
+from xalign_ros.io.keyframe_fields import KeyframeFields, keyframe_of
 from xalign_ros.io.log_files import reader_for, stored, translated, words
 from xalign_ros.io.log_types import defined, deserialized, typestore
 from xalign_ros.io.mcap_file import McapFile
-from xalign_ros.io.messages import KEYFRAME, keyframe_from_message
+from xalign_ros.io.messages import KEYFRAME, keyframe_fields
 
 __all__ = ["Log", "LogWriter", "RawMessage", "Topic", "typestore"]
 
@@ -140,22 +142,26 @@ class Log:
         return names[0]
 
     def keyframes(self, topic: str | None = None) -> Iterator[tuple[int, Keyframe | None, Rejection | None]]:
-        """(log time in ns, then what `keyframe_from_message` says), by log time; equal times in the order of the file.
+        """(log time in ns, then what `keyframe_of` says), by log time; equal times in the order of the file.
 
         Raises LogError where bytes are damaged or fewer messages come than the log announces.
         """
         for connection, time_ns, data in self._read({(self.keyframe_topic(topic), KEYFRAME)}):
-            with self._named(connection, time_ns):
-                message = self._message(connection, data)
-            yield time_ns, *keyframe_from_message(message)
+            try:
+                fields = self._keyframe_fields(connection, data)
+            except Exception as error:
+                raise self._named(error, connection, time_ns) from error
+            yield time_ns, *keyframe_of(fields)
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
         """The messages of `topics` (exact names; None = all) by log time; those of ROS 1 are converted to CDR."""
         known = set(self._announced)
         wanted = known if topics is None else {(name, kind) for name, kind in known if name in set(topics)}
         for connection, time_ns, data in self._read(wanted):
-            with self._named(connection, time_ns):
+            try:
                 cdr = self._cdr(connection, data)
+            except Exception as error:
+                raise self._named(error, connection, time_ns) from error
             yield RawMessage(connection.topic, connection.msgtype, time_ns, bytes(cdr))
 
     def _read(self, wanted: set[tuple[str, str]]) -> Iterator[tuple[Connection, int, bytes]]:
@@ -178,10 +184,11 @@ class Log:
             told = f"announces {announced} messages on {names} but delivers {delivered}"
             raise LogError(f"{self.path} {told}: reindex it (`ros2 bag reindex`, `mcap recover`)")
 
-    def _message(self, connection: Connection, data: bytes) -> Any:
+    def _keyframe_fields(self, connection: Connection, data: bytes) -> KeyframeFields:
         if isinstance(connection.ext, ConnectionExtRosbag1):
-            return self._store(connection, seq=True).deserialize_ros1(data, connection.msgtype)
-        return deserialized(self._store(connection), data, connection.msgtype)
+            return keyframe_fields(self._store(connection, seq=True).deserialize_ros1(data, connection.msgtype))
+        self._store(connection)  # which refuses any other definition than ours
+        return keyframe_fields_from_cdr(data)
 
     def _cdr(self, connection: Connection, data: bytes) -> bytes:
         if isinstance(connection.ext, ConnectionExtRosbag1):
@@ -191,22 +198,19 @@ class Log:
     def _store(self, connection: Connection, seq: bool = False) -> Typestore:
         """The type as the log defines it, else as we do."""
         definition = connection.msgdef
-        if definition.format is not MessageDefinitionFormat.MSG or not definition.data.strip():
+        if definition.format is not MessageDefinitionFormat.MSG or not definition.data or definition.data.isspace():
             return typestore()
         store, difference = defined(connection.msgtype, definition.data, seq)
         if difference:
             raise LogError(f"{self.path} has another {difference}")
         return store
 
-    @contextmanager
-    def _named(self, connection: Connection, time_ns: int) -> Iterator[None]:
-        try:
-            yield
-        except XalignError:
-            raise
-        except Exception as error:
-            where = f"the message on {connection.topic} at {time_ns} ns"
-            raise LogError(f"{self.path} is damaged: {where} is no {connection.msgtype}: {words(error)}") from error
+    def _named(self, error: Exception, connection: Connection, time_ns: int) -> XalignError:
+        """Ours as it is; what damaged bytes make a foreign reader raise has no list."""
+        if isinstance(error, XalignError):
+            return error
+        where = f"the message on {connection.topic} at {time_ns} ns"
+        return LogError(f"{self.path} is damaged: {where} is no {connection.msgtype}: {words(error)}")
 
     def _listing(self) -> str:
         told = [f"{t.name} ({t.type}, {t.messages})" for t in self.topics()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from operator import itemgetter
@@ -42,6 +43,7 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.unfinished = ""
+        self._packed = bytearray()
         self.connections: list[Connection] = []
         self._blocks: list[Block] = []
         self._schemas: dict[int, Schema] = {}
@@ -65,20 +67,22 @@ class McapFile:
     def close(self) -> None:
         os.close(self._file)
 
-    def messages(self, connections: Iterable[Connection]) -> Iterator[tuple[Connection, int, memoryview]]:
+    def messages(self, connections: Iterable[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
         """By log time; equal times in the order of the file."""
         by_id = {c.id: c for c in connections}
+
+        def copied(found: Found) -> tuple[Connection, int, bytes]:
+            """Without a view, which would keep the memory of its block from being that of the next one."""
+            return by_id[found[2]], found[0], bytes(found[3])
+
         blocks = sorted(b for b in self._blocks if not b.channels or not by_id.keys().isdisjoint(b.channels))
         pending: list[Found] = []
         for n, block in enumerate(blocks, 1):
             pending += [found for found in self._loaded(block) if found[2] in by_id]
             pending.sort(key=itemgetter(0, 1))
-            until = blocks[n].start_ns if n < len(blocks) else None
-            ready = next(
-                (k for k, found in enumerate(pending) if until is not None and found[0] >= until), len(pending)
-            )
-            for time_ns, _, channel, data in pending[:ready]:
-                yield by_id[channel], time_ns, data
+            ready = bisect_left(pending, blocks[n].start_ns, key=itemgetter(0)) if n < len(blocks) else len(pending)
+            for k in range(ready):
+                yield copied(pending[k])
             del pending[:ready]
 
     # -- what there is -------------------------------------------------------------------------------------------
@@ -182,15 +186,29 @@ class McapFile:
     def _loaded(self, block: Block) -> list[Found]:
         """Raises LogError where the block is not what index and checksum say."""
         try:
-            found = list(messages(self._read(block.offset, block.size)))
+            found = list(messages(self._chunk(block) if block.channels else self._read(block.offset, block.size)))
         except Exception as error:  # what damaged bytes make a decompressor raise has no list
             raise LogError(f"{self.path} is damaged at byte {block.offset}: {error}; try `mcap recover`") from error
         if any(not block.start_ns <= time_ns <= block.end_ns for time_ns, _, _ in found):
             raise LogError(f"{self.path} is damaged: its index does not fit byte {block.offset}; try `mcap recover`")
         return [(time_ns, block.offset, channel, data) for time_ns, channel, data in found]
 
+    def _chunk(self, block: Block) -> bytes:
+        """Its records. The packed bytes go to the same place each time: new memory costs more than reading does."""
+        self._inside(block.offset, block.size)
+        if len(self._packed) < block.size:
+            self._packed = bytearray(block.size)
+        record = memoryview(self._packed)[: block.size]
+        os.preadv(self._file, [record], block.offset)
+        if RECORD.unpack_from(record) != (Opcode.CHUNK, block.size - RECORD.size):
+            raise ValueError("there is no chunk")
+        return unpacked(record[RECORD.size :])
+
     def _read(self, offset: int, size: int) -> bytes:
         """At a place, since several may read at once. Raises LogError where the file ends before."""
+        self._inside(offset, size)
+        return os.pread(self._file, size, offset)
+
+    def _inside(self, offset: int, size: int) -> None:
         if offset + size > self._size:
             raise LogError(f"{self.path} is damaged: it has no byte {offset + size}; try `mcap recover`")
-        return os.pread(self._file, size, offset)

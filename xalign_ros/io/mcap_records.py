@@ -6,7 +6,6 @@ import struct
 from collections.abc import Iterator
 from io import BytesIO
 from typing import Any
-from zlib import crc32
 
 import zstandard
 from lz4.frame import decompress as lz4_decompress
@@ -14,12 +13,18 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
 
+try:
+    from isal.isal_zlib import crc32
+except ImportError:  # the same number in six times the time
+    from zlib import crc32
+
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, start of summary, start of offsets, crc of summary, magic
 RECORD = struct.Struct("<BQ")  # opcode, length
 CHUNK = struct.Struct("<QQQII")  # first and last log time, raw size, its crc, length of the compression's name
 SIZE = struct.Struct("<Q")
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+ZSTD = zstandard.ZstdDecompressor()
 LARGEST = 1 << 31  # bytes of a chunk that we unpack
 KINDS: dict[int, Any] = {
     Opcode.SCHEMA: Schema,
@@ -49,18 +54,18 @@ def parsed(opcode: int, content: bytes) -> Schema | Channel | ChunkIndex | Stati
     return kind.read(ReadDataStream(BytesIO(content))) if kind else None
 
 
-def unpacked(chunk: bytes) -> bytes:
+def unpacked(chunk: bytes | memoryview) -> bytes:
     """The records in a chunk's content. Raises ValueError where its size or its checksum is another."""
     _, _, size, crc, named = CHUNK.unpack_from(chunk)
     at = CHUNK.size + named
-    name, (stored,) = chunk[CHUNK.size : at], SIZE.unpack_from(chunk, at)
+    name, (stored,) = bytes(chunk[CHUNK.size : at]), SIZE.unpack_from(chunk, at)
     packed = memoryview(chunk)[at + SIZE.size : at + SIZE.size + stored]
     if size > LARGEST or len(packed) != stored:
         raise ValueError("the sizes of a chunk do not fit")
     if name == b"zstd":
         if zstandard.frame_content_size(packed) not in (-1, size):
             raise ValueError("the sizes of a chunk do not fit")
-        data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        data = ZSTD.decompress(packed, max_output_size=size)
     elif name == b"lz4":
         data = lz4_decompress(packed)
     elif name == b"":

@@ -6,7 +6,6 @@ How messages are met and built, and how a ROS covariance relates to ours, is tol
 from __future__ import annotations
 
 import hashlib
-import math
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -15,15 +14,13 @@ from typing import Any
 import numpy as np
 
 from xalign_ros.core.lie import Array, rotation_from_quat
-from xalign_ros.core.records import AlignmentState, Anchor, Correction, Features, Keyframe, Norm, Rejection, State
+from xalign_ros.core.records import AlignmentState, Anchor, Correction, Keyframe, Rejection, State
 from xalign_ros.core.transforms import SE3, Sim3, frozen
 from xalign_ros.io import ros_fields as ros
+from xalign_ros.io.keyframe_fields import KeyframeFields, keyframe_of
 from xalign_ros.io.ros_fields import Types
 
 KEYFRAME = "xalign_msgs/msg/Keyframe"
-NORMS = frozenset(Norm)
-QUAT_TOLERANCE = 1e-3  # of a quaternion's norm from 1; a sender's rounding is far smaller
-NO_FEATURES = Features(np.zeros((0, 2)), np.zeros((0, 0)))
 UNKNOWN_SIM3 = (np.full(3, np.nan), np.full(4, np.nan), float("nan"))
 STATE_FIELDS: dict[str, Callable[[Any], Any]] = {  # of the same name and meaning in record and message
     "session": int,
@@ -41,77 +38,31 @@ STATE_FIELDS: dict[str, Callable[[Any], Any]] = {  # of the same name and meanin
 
 
 def keyframe_from_message(msg: Any) -> tuple[Keyframe | None, Rejection | None]:
-    """The keyframe of an xalign_msgs/Keyframe and what is structurally wrong with it.
+    """What `keyframe_of` says of an xalign_msgs/Keyframe."""
+    return keyframe_of(keyframe_fields(msg))
 
-    (keyframe, None): all well. (keyframe, rejection): the pose is good but the features are not, so the keyframe has
-    none; with `no_intrinsics` it has no camera either. (None, rejection): `bad_pose`. A pose covariance that is all
-    zero, or none at all (not finite, a negative variance), is unknown: None. What needs no knowledge of the message
-    (pixels outside the image, order of stamps, duplicates, no features) is not judged here.
-    """
-    stamp_ns, session, keyframe_id = ros.stamp_of(msg.header.stamp), int(msg.session), int(msg.id)
 
-    def rejection(reason: str, detail: str) -> Rejection:
-        return Rejection(keyframe_id, session, stamp_ns, reason, detail)
-
-    pose = ros.pose_seven(msg.pose.pose)
-    norm = math.sqrt(sum(x * x for x in pose[3:].tolist()))  # too large a number is infinite
-    if not np.isfinite(pose).all():
-        return None, rejection("bad_pose", f"the pose is not finite: x y z qx qy qz qw = {pose.tolist()}")
-    if abs(norm - 1) > QUAT_TOLERANCE:
-        return None, rejection("bad_pose", f"the pose's quaternion has norm {norm:.6g}, not 1")
-    T_odom_cam = SE3.from_quat(pose[3:], pose[:3])
-    info, features, fault = ros.camera_from_info(msg.camera), _features(msg.features), None
-    if isinstance(info, str):
-        fault = rejection("no_intrinsics", info)
-    elif isinstance(features, tuple):
-        fault = rejection(*features)
-    keyframe = Keyframe(
-        stamp_ns=stamp_ns,
-        session=session,
-        id=keyframe_id,
-        T_odom_cam=T_odom_cam,
-        camera=None if isinstance(info, str) else info,
-        features=NO_FEATURES if fault or isinstance(features, tuple) else features,
-        metric_scale=bool(msg.metric_scale),
-        cov_cam=ros.known_covariance(msg.pose.covariance, T_odom_cam.R),
+def keyframe_fields(msg: Any) -> KeyframeFields:
+    """Of an xalign_msgs/Keyframe that somebody else deserialised."""
+    f = msg.features
+    return KeyframeFields(
+        stamp_ns=ros.stamp_of(msg.header.stamp),
         odom_frame=str(msg.header.frame_id),
         cam_frame=str(msg.child_frame_id),
-    )
-    return keyframe, fault
-
-
-def _features(msg: Any) -> Features | tuple[str, str]:
-    """The features of an xalign_msgs/Features, or the reason and the sentence why they cannot be used."""
-    uv = ros.numbers(msg.uv, "f")
-    n, odd = divmod(uv.size, 2)
-    if odd:
-        return "bad_pixel", f"uv holds {uv.size} numbers, which are no pairs"
-    sigma_px, track_ids, xyz_cam = (
-        ros.numbers(msg.sigma_px, "f"),
-        ros.numbers(msg.track_ids, "Q"),
-        ros.numbers(msg.xyz_cam, "f"),
-    )
-    for name, values, each in (("sigma_px", sigma_px, 1), ("track_ids", track_ids, 1), ("xyz_cam", xyz_cam, 3)):
-        if values.size not in (0, each * n):
-            return "bad_pixel", f"{name} holds {values.size} numbers, {n} features need {each * n} or none"
-    size, descriptors = int(msg.descriptor_bytes), ros.numbers(msg.descriptors, "B")
-    if int(msg.norm) not in NORMS:
-        return "bad_descriptor", f"norm {int(msg.norm)} is unknown"
-    norm = Norm(int(msg.norm))
-    dtype = np.dtype(norm.dtype).newbyteorder("<")
-    if descriptors.size != n * size:
-        why = f"{n} features of {size} bytes need {n * size}"
-        return "bad_descriptor", f"descriptors hold {descriptors.size} bytes, {why}"
-    if size % dtype.itemsize:
-        return "bad_descriptor", f"a descriptor of {size} bytes is no whole number of float32"
-    return Features(
-        uv=uv.reshape(n, 2),
-        descriptors=descriptors.reshape(n, size).view(dtype) if size else descriptors.reshape(n, 0),
-        name=str(msg.descriptor),
-        norm=norm,
-        sigma_px=sigma_px if sigma_px.size else None,
-        track_ids=track_ids if track_ids.size else None,
-        xyz_cam=xyz_cam.reshape(n, 3) if xyz_cam.size else None,
+        id=int(msg.id),
+        session=int(msg.session),
+        metric_scale=bool(msg.metric_scale),
+        pose=ros.pose_seven(msg.pose.pose).tolist(),
+        covariance=np.asarray(msg.pose.covariance, float),
+        camera=ros.camera_from_info(msg.camera),
+        descriptor=str(f.descriptor),
+        norm=int(f.norm),
+        descriptor_bytes=int(f.descriptor_bytes),
+        uv=ros.numbers(f.uv, "f"),
+        descriptors=ros.numbers(f.descriptors, "B"),
+        sigma_px=ros.numbers(f.sigma_px, "f"),
+        track_ids=ros.numbers(f.track_ids, "Q"),
+        xyz_cam=ros.numbers(f.xyz_cam, "f"),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from xalign_ros.core.lie import Array
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io import ros_fields as ros
-from xalign_ros.io.messages import QUAT_TOLERANCE
+from xalign_ros.io.keyframe_fields import QUAT_TOLERANCE
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 

@@ -147,9 +147,14 @@ def _swap_and_rotate(R_a_b: ArrayLike) -> Array:
 
 def camera_from_info(info: Any) -> Camera | str:
     """The camera of a sensor_msgs/CameraInfo (K, D, size), or the sentence why there is none."""
-    K = np.asarray(info.k if hasattr(info, "k") else info.K, float)
-    D = np.asarray(info.d if hasattr(info, "d") else info.D, float)
-    return _camera(str(info.distortion_model), K.tobytes(), D.tobytes(), int(info.width), int(info.height))
+    K, D = (info.k, info.d) if hasattr(info, "k") else (info.K, info.D)
+    return camera_of(str(info.distortion_model), K, D, int(info.width), int(info.height))
+
+
+def camera_of(distortion: str, K: ArrayLike, D: ArrayLike, width: int, height: int) -> Camera | str:
+    """`camera_from_info` of its fields: K (9,) row-major and D as in the message, size in px."""
+    K, D = np.asarray(K, float), np.asarray(D, float)
+    return _camera(distortion, K.tobytes(), D.tobytes(), width, height)
 
 
 @lru_cache(maxsize=16)
