@@ -1,13 +1,18 @@
 """xalign eval: figures by hand, those of evo, and what replay itself says of its run."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from message_samples import STAMP, a_correction
 
 from xalign_ros.apps.main import main
 from xalign_ros.core.lie import so3_exp
+from xalign_ros.io.corrections import CORRECTION
+from xalign_ros.io.log import LogWriter, typestore
+from xalign_ros.io.messages import correction_message
 from xalign_ros.io.tum import Trajectory, write_tum
 
 
@@ -82,6 +87,10 @@ def test_a_run_and_its_output_log_have_the_errors_that_replay_says(tmp_path: Pat
         assert r["not_aligned"]["rmse_deg"] == pytest.approx(said["rot_rmse_deg"], rel=1e-4) and r["wrong"] == 0
     r = result_of(tmp_path / "o.mcap", sim / "truth.tum", capsys)
     assert r["nees_mean"] == pytest.approx(said["nees_mean"], rel=0.02) and 0.5 < r["within_2_sigma"] <= 1
+    assert r["jumps"] == said["jumps"] and r["jump_causes"] == said["jump_causes"] and r["latency_ms"] is None
+    assert r["raw_from_lock_rmse_m"] == pytest.approx(said["raw_from_lock_rmse_m"], rel=1e-6) and said["worse_than_raw"]
+    for key in ("part", "most_m"):
+        assert r["worse_than_raw"][key] == pytest.approx(said["worse_than_raw"][key], rel=1e-3)
     assert r["anchors"]["accepted"] == said["anchors_accepted"] and r["anchors"]["precision"] == 1.0
     assert main(["eval", str(tmp_path / "o.mcap"), str(sim / "truth.tum")]) == 0
     assert "precision 1" in capsys.readouterr().out
@@ -96,3 +105,15 @@ def test_what_cannot_be_compared_is_one_sentence(tmp_path: Path, capsys) -> None
         assert main(["eval", *map(str, pair)]) == 1
         captured = capsys.readouterr()
         assert said in captured.err and captured.out == "" and captured.err.count("\n") == 1
+
+
+def test_latency_of_a_recorded_run(tmp_path: Path, capsys) -> None:
+    rng, types = np.random.default_rng(0), typestore().types.__getitem__
+    write_tum(tmp_path / "truth.tum", Trajectory([STAMP, STAMP + 10**9], [np.eye(3)] * 2, np.zeros((2, 3))))
+    with LogWriter(tmp_path / "o.mcap") as log:
+        for n, late_ns in enumerate((10_000_000, 30_000_000)):
+            correction = replace(a_correction(rng, n), stamp_ns=STAMP + n * 10**9)
+            message = correction_message(types, correction, "map", "odom")
+            log.write("correction", CORRECTION, message, correction.stamp_ns + late_ns)
+    latency = result_of(tmp_path / "o.mcap", tmp_path / "truth.tum", capsys)["latency_ms"]
+    assert latency == {"p50": 20.0, "p95": pytest.approx(29.0), "p99": pytest.approx(29.8), "max": 30.0}

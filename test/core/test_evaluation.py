@@ -1,9 +1,12 @@
 """The figures of a run on hand-drawn steps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from xalign_ros.core.evaluation import errors, jumped, raw_error, summarize, summarize_errors
+from xalign_ros.core.beside_odometry import carried_from_lock, jumps, never_worse
+from xalign_ros.core.evaluation import errors, raw_error, summarize, summarize_errors
 from xalign_ros.core.records import AlignmentState, Anchor, Correction, Rejection, State, Step
 from xalign_ros.core.trajectory_errors import anchor_errors
 from xalign_ros.core.transforms import SE3, Sim3
@@ -47,7 +50,8 @@ def test_summary_of_a_hand_drawn_run() -> None:
     assert s["anchors_rejected"] == {"inconsistent": 1, "too_few_matches": 1}
     assert s["first_lock_s"] == 2.0 and s["first_lock_keyframe"] == 2
     assert s["coverage"] == 3 / 4
-    assert s["jumps"] == 1  # 0.6 m at the fifth keyframe
+    assert s["jumps"] == 1 and s["jump_causes"] == {"window": 1}  # at the fifth keyframe
+    assert s["largest_jump"] == {"m": pytest.approx(0.6), "deg": 0.0, "at_s": 4.0, "cause": "window"}
     assert s["state_seconds"] == {
         "UNINITIALIZED": 1.0,
         "CANDIDATE": 1.0,
@@ -88,11 +92,36 @@ def test_raw_error_is_after_the_best_similarity() -> None:
 def test_a_jump_is_measured_against_the_prediction_not_the_last_pose() -> None:
     a, b = step(2, 2.0).correction, step(9, 9.0).correction
     assert a and b
-    assert not jumped(a, b)  # seven metres on, as the odometry says
-    turned = Correction(
-        9, 0, 9 * SECOND, Sim3(SE3.exp([0, 0, 0.2, 0, 0, 0]).R, [0, 0, 0], 1), np.eye(7), at(9), np.eye(6)
-    )
-    assert jumped(a, turned)
+    assert not jumps([a, b], [])  # seven metres on, as the odometry says
+    R = SE3.exp([0, 0, 0.2, 0, 0, 0]).R
+    turned = Correction(9, 0, 9 * SECOND, Sim3(R, [0, 0, 0], 1), np.eye(7), at(9), np.eye(6))
+    (jump,) = jumps([a, turned], {(0, 9)})
+    assert jump.cause == "anchor" and jump.angle_rad == pytest.approx(0.2) and jump.stamp_ns == 9 * SECOND
+
+
+def test_a_session_that_begins_anew_is_a_jump_from_pose_to_pose() -> None:
+    a, b = step(2, 2.0).correction, step(3, 3.0).correction
+    (jump,) = jumps([a, replace(b, session=1)], [])
+    assert jump.cause == "session" and jump.length_m == pytest.approx(1.0)
+
+
+def test_where_the_odometry_alone_was_nearer() -> None:
+    """It drifts by 0.1 m a keyframe from the lock on; the corrections are right but for the third and fourth."""
+    run = [step(n, 1.1 * n, shift=s) for n, s in enumerate([0.0, 0.0, 0.5, 0.6, 0.0, 0.0])]
+    exact = [s.correction for s in run]
+    truth = [at(1.1 * n) for n in range(6)]
+    np.testing.assert_allclose(carried_from_lock(exact)[:, 0], range(6))
+    found = never_worse(exact, truth, 0)
+    assert found["raw_from_lock_rmse_m"] == pytest.approx(np.sqrt((0.01 * np.arange(6) ** 2).mean()))
+    assert found["worse_than_raw"] == {
+        "part": pytest.approx(2 / 6),
+        "most_m": pytest.approx(0.3),
+        "at_s": 2.0,
+        "from_s": 2.0,
+        "to_s": 3.0,
+    }
+    assert never_worse(exact[:2], truth[:2], 0)["worse_than_raw"] is None
+    assert never_worse(exact, [None] * 6, 0) == {"raw_from_lock_rmse_m": None, "worse_than_raw": None}
 
 
 def test_anchors_right_and_wrong_accepted_and_refused() -> None:

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from xalign_ros.core.beside_odometry import jump_figures, jumps, never_worse
 from xalign_ros.core.lie import Array
-from xalign_ros.core.records import INPUT_REASONS, Correction, State, Step
+from xalign_ros.core.records import INPUT_REASONS, State, Step
 from xalign_ros.core.similarity import fit_similarity
 from xalign_ros.core.transforms import SE3
-
-JUMP_M, JUMP_RAD = 0.5, np.deg2rad(5.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,16 +55,6 @@ def raw_error(odometry: Sequence[SE3 | None], truth: Sequence[SE3 | None]) -> Ar
         return np.zeros(0)
 
 
-def jumped(before: Correction, after: Correction) -> bool:
-    """Whether the newest pose differs from what the last correction and the odometry predicted for it."""
-    if before.session != after.session:
-        return True
-    T_odom_cam = after.S_map_odom.inverse() @ after.T_map_cam
-    predicted = (before.S_map_odom @ T_odom_cam).rigid_pose()
-    d = (predicted.inverse() @ after.T_map_cam).log()
-    return bool(np.linalg.norm(predicted.t - after.T_map_cam.t) > JUMP_M or np.linalg.norm(d[:3]) > JUMP_RAD)
-
-
 def summarize(steps: Sequence[Step], step_s: Sequence[float], digest: str) -> dict[str, Any]:
     """The JSON object of `xalign replay --json` but for the errors; step_s are the steps' durations in seconds."""
     corrected = [n for n, s in enumerate(steps) if s.correction is not None]
@@ -74,6 +63,7 @@ def summarize(steps: Sequence[Step], step_s: Sequence[float], digest: str) -> di
     first = corrected[0] if corrected else None
     last = steps[-1].state if steps else None
     ms = np.array(step_s) * 1e3
+    jumped = jumps(corrections, {(s.session, s.keyframe_id) for s in steps if s.anchor is not None})
     span_s = (steps[-1].stamp_ns - steps[0].stamp_ns) / 1e9 if steps else 0.0
     return {
         "keyframes": len(steps),
@@ -83,7 +73,8 @@ def summarize(steps: Sequence[Step], step_s: Sequence[float], digest: str) -> di
         "first_lock_s": None if first is None else (steps[first].stamp_ns - steps[0].stamp_ns) / 1e9,
         "first_lock_keyframe": first,
         "coverage": 0.0 if first is None else len(corrected) / (len(steps) - first),
-        "jumps": sum(jumped(a, b) for a, b in itertools.pairwise(corrections)),
+        "jumps": len(jumped),
+        **jump_figures(jumped, steps[0].stamp_ns if steps else 0),
         "scale": last.S_map_odom.s if last and last.S_map_odom else None,
         "scale_sigma": last.scale_sigma if last and last.S_map_odom else None,
         "state_seconds": _state_seconds(steps),
@@ -95,9 +86,11 @@ def summarize(steps: Sequence[Step], step_s: Sequence[float], digest: str) -> di
 
 def summarize_errors(
     steps: Sequence[Step], odometry: Sequence[SE3 | None], truth: Sequence[SE3 | None]
-) -> dict[str, float | None]:
+) -> dict[str, Any]:
     """The error part of the JSON object."""
     e, raw = errors(steps, truth), raw_error(odometry, truth)
+    corrected = [(s.correction, true) for s, true in zip(steps, truth, strict=True) if s.correction is not None]
+    start_ns = steps[0].stamp_ns if steps else 0
     return {
         "ate_rmse_m": _rms(e.position),
         "ate_p95_m": _percentile(e.position, 95),
@@ -105,6 +98,7 @@ def summarize_errors(
         "rot_rmse_deg": None if not len(e.rotation) else float(np.rad2deg(np.sqrt((e.rotation**2).mean()))),
         "nees_mean": None if not len(e.nees) else float(e.nees.mean()),
         "raw_ate_rmse_m": _rms(raw),
+        **never_worse([c for c, _ in corrected], [true for _, true in corrected], start_ns),
     }
 
 

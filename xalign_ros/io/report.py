@@ -30,6 +30,14 @@ FIGURES = {  # key of the result, nested ones dotted: unit and meaning; {m} is t
     "first_lock_keyframe": ("", "index of the keyframe with the first pose, counted from 0"),
     "coverage": ("", "share of keyframes with a pose, from the first pose on; 1 = all"),
     "jumps": ("", "poses over 0.5 {m} or 5° off what the last one and the odometry predicted"),
+    "jump_causes.anchor": ("", "of these by a pose found at that keyframe"),
+    "jump_causes.window": ("", "of these as earlier keyframes were seen anew"),
+    "jump_causes.session": ("", "of these as the odometry began anew; from pose to pose"),
+    "largest_jump": ("", "the longest of them"),
+    "largest_jump.m": ("{m}", "the longest of them"),
+    "largest_jump.deg": ("°", "its angle"),
+    "largest_jump.at_s": ("s", "when it was, from the first keyframe on"),
+    "largest_jump.cause": ("", "what made it"),
     "scale": ("{m}", "length of one odometry unit in the map, at the last keyframe"),
     "scale_sigma": ("", "relative standard deviation of the scale; 0.01 = 1 %"),
     "hash": ("", "sha256 over all corrections; equal hashes mean equal results"),
@@ -44,6 +52,13 @@ FIGURES = {  # key of the result, nested ones dotted: unit and meaning; {m} is t
     "rot_rmse_deg": ("°", "rotation error, root mean square"),
     "nees_mean": ("", "squared error over predicted covariance: 6 where that is right, more = too sure"),
     "raw_ate_rmse_m": ("{m}", "position error of the odometry alone, root mean square after its best fit in hindsight"),
+    "raw_from_lock_rmse_m": ("{m}", "position error of the odometry alone, put into the map by the first pose"),
+    "worse_than_raw": ("", "where poses are farther from the truth than that odometry"),
+    "worse_than_raw.part": ("", "share of the poses that are farther from the truth than that"),
+    "worse_than_raw.most_m": ("{m}", "the most that one is farther"),
+    "worse_than_raw.at_s": ("s", "when that is, from the first keyframe on"),
+    "worse_than_raw.from_s": ("s", "begin of the stretch around it"),
+    "worse_than_raw.to_s": ("s", "end of the stretch around it"),
 }
 
 
