@@ -240,6 +240,24 @@ def test_features_of_nowhere_have_no_place(world, index):
     assert places(blank, index, CONFIG) == []
 
 
+def test_few_near_descriptors_outweigh_many_that_hardly_pass_the_gate(world, index):
+    """Chance finds a point for most features of any image; seldom one that is near."""
+    map_, rng = world.map, np.random.default_rng(1)
+    here, there = (index.points_of(index.keyframes_near(world.truth[n], 1)) for n in (3, 22))
+    here, there = np.setdiff1d(here, there), np.setdiff1d(there, here)
+
+    def seen_as(points, bits):
+        flip = np.zeros((len(points), 8 * map_.descriptors.shape[1]), np.uint8)
+        for row in flip:
+            row[rng.choice(len(row), bits, replace=False)] = 1
+        return map_.descriptors[points] ^ np.packbits(flip, axis=1)
+
+    hardly = int(map_.descriptor_gate) - 3
+    codes = np.concatenate([seen_as(here[:20], 4), seen_as(there[:60], hardly)])
+    best = places(Features(np.zeros((len(codes), 2)), codes, "code"), index, CONFIG)[0]
+    assert np.isin(here[:20], index.points_of(best)).mean() > 0.9
+
+
 @pytest.mark.parametrize("flip", [worlds.FLIP, 0.0], ids=["noisy", "exact"])
 @pytest.mark.parametrize("keyframes", [12, 3], ids=["wide", "narrow"])
 def test_both_of_two_look_alikes_are_among_the_places(keyframes, flip):

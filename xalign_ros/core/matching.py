@@ -140,22 +140,26 @@ def places(features: Features, index: MapIndex, config: Matching) -> list[np.nda
     """Places of the whole map that this keyframe looks like, best first, each an array of covisible map keyframes.
 
     Every feature (at most cold_features of them, evenly chosen) votes through its two nearest map points, since one of
-    two look-alikes may be nearest to all of them, for the keyframes that see them. What a chosen place's keyframes see is
-    taken out before the next is looked for, so that the next is not the same place from a step further.
+    two look-alikes may be nearest to all of them, for the keyframes that see them; the more the nearer its descriptor is,
+    (1 - distance / gate)^2, as a chance pair is seldom near (after Jegou, Douze and Schmid, IJCV 2010, section 4.2). What a
+    chosen place's keyframes see is taken out before the next is looked for, so that the next is not the same place from a
+    step further.
     """
     map_ = index.map
     chosen = np.unique(np.linspace(0, len(features) - 1, min(len(features), config.cold_features)).astype(int))
     _, points, distance = index.vocabulary.nearest(features.descriptors[chosen], map_.descriptors, map_.norm, 2)
-    points = points[distance <= map_.descriptor_gate]
+    near = distance < map_.descriptor_gate
+    points, weight = points[near], (1 - distance[near] / map_.descriptor_gate) ** 2
     result = []
     for _ in range(config.cold_places):
-        votes = index.votes(points)
+        votes = index.votes(points, weight)
         best = int(votes.argmax())
         if votes[best] <= 0:
             break
         place = index.covisible(best, config.place_keyframes)
         result.append(place)
-        points = points[~np.isin(points, index.points_of(place))]
+        left = ~np.isin(points, index.points_of(place))
+        points, weight = points[left], weight[left]
     return result
 
 

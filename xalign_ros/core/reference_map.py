@@ -185,14 +185,15 @@ class MapIndex:
         near = np.argpartition(cost, count)[:count] if count < len(cost) else np.arange(len(cost))
         return near[np.lexsort((near, cost[near]))]
 
-    def votes(self, points: np.ndarray) -> Array:
-        """Votes (K,) of matched points for the map keyframes that see them, each point's vote shared between them."""
+    def votes(self, points: np.ndarray, weight: Array | None = None) -> Array:
+        """Votes (K,) of matched points, of weight (N,) or 1 each, for the keyframes that see them, each shared between them."""
         v = self.visibility
         first = v.point_offset[points]
         counts = v.point_offset[points + 1] - first
         rows = np.repeat(first - np.r_[0, np.cumsum(counts)[:-1]], counts) + np.arange(counts.sum())
-        weight = np.repeat(1 / np.sqrt(np.maximum(counts, 1)), counts)
-        return np.asarray(np.bincount(v.point_keyframe[rows], weight, minlength=len(self.map.keyframe_t)), float)
+        each = (1.0 if weight is None else weight) / np.sqrt(np.maximum(counts, 1))
+        votes = np.bincount(v.point_keyframe[rows], np.repeat(each, counts), minlength=len(self.map.keyframe_t))
+        return np.asarray(votes, float)
 
     def covisible(self, keyframe: int, count: int) -> np.ndarray:
         """The map keyframes that share most points with this one, itself first."""
