@@ -237,7 +237,13 @@ def test_odometry_is_corrected_at_its_own_rate_while_steps_run(world, tmp_path):
     arguments = ["-p", f"base_from_cam:={T_base_cam}", "-p", "base_frame:=robot"]
     with (
         live.node(tmp_path, world.map, *arguments),
-        live.observer(**TOPICS, odometry_corrected=ODOMETRY) as me,
+        live.observer(
+            **TOPICS,
+            odometry_corrected=ODOMETRY,
+            odometry_smooth=ODOMETRY,
+            odometry_scaled=ODOMETRY,
+            map_points="sensor_msgs/msg/PointCloud2",
+        ) as me,
     ):
         assert me.hears()
         player = live.Process(
@@ -256,6 +262,12 @@ def test_odometry_is_corrected_at_its_own_rate_while_steps_run(world, tmp_path):
     due = [stamp for stamp in T_odom_base if stamp > first + world.period_ns]
     assert len(due) >= 30 * BETWEEN
     assert sum(stamp in out for stamp in due) > 0.9 * len(due)
+    for topic, frame in (("odometry_smooth", "map"), ("odometry_scaled", "odom_scaled")):
+        found = me.received[topic]
+        assert len(found) > 0.9 * len(due) and {m.header.frame_id for m in found} == {frame}
+        assert (np.diff(stamps(found)) > 0).all()
+    (cloud,) = me.received["map_points"]
+    assert cloud.width * cloud.height == len(read_map(world.map).points)
     for stamp, message in out.items():
         T = odometry_pose(message)
         nearest = min(
