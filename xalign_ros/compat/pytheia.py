@@ -10,6 +10,9 @@ from xalign_ros.compat import (
     pytheia_adjuster,
     pytheia_bundle,
     pytheia_bundle_options,
+    pytheia_clouds,
+    pytheia_intrinsics,
+    pytheia_localization,
     pytheia_pose_graph,
     pytheia_priors,
     pytheia_reconstruction,
@@ -25,6 +28,9 @@ sfm = SimpleNamespace(
             pytheia_adjuster,
             pytheia_bundle,
             pytheia_bundle_options,
+            pytheia_clouds,
+            pytheia_intrinsics,
+            pytheia_localization,
             pytheia_pose_graph,
             pytheia_priors,
             pytheia_reconstruction,
@@ -34,4 +40,7 @@ sfm = SimpleNamespace(
         )
         for name in module.__all__
     }
+)
+solvers = SimpleNamespace(
+    RansacParameters=pytheia_localization.RansacParameters, RansacSummary=pytheia_localization.RansacSummary
 )

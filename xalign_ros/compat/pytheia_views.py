@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from xalign_ros.compat import pytheia_intrinsics as intrinsics
 from xalign_ros.core.lie import Array, so3_exp, so3_log
 
 __all__ = ["Camera", "Feature", "View"]
@@ -67,12 +69,25 @@ class Camera:
     def SetImageSize(self, width: int, height: int) -> None:
         self.size = int(width), int(height)
 
+    def SetFromCameraIntrinsicsPriors(self, prior: intrinsics.CameraIntrinsicsPrior) -> None:
+        """Raises ValueError on a prior that is no pinhole without distortion."""
+        self.intrinsics = prior.pinhole()
+        self.SetImageSize(prior.image_width, prior.image_height)
+
+    def CameraIntrinsicsPriorFromIntrinsics(self) -> intrinsics.CameraIntrinsicsPrior:
+        prior, (fx, fy, cx, cy) = intrinsics.CameraIntrinsicsPrior(*self.size), self.intrinsics.tolist()
+        known = {"focal_length": fx, "aspect_ratio": fy / fx, "principal_point": (cx, cy), "skew": 0.0}
+        for name, value in known.items():
+            getattr(prior, name).value, getattr(prior, name).is_set = value, True
+        return prior
+
 
 class View:
     """With priors of position (world), orientation (angle-axis, world to camera) and gravity (camera), or None."""
 
     def __init__(self, name: str, timestamp: float = 0.0) -> None:
         self._name, self._timestamp, self._estimated, self._camera = name, timestamp, False, Camera()
+        self._intrinsics_prior = intrinsics.CameraIntrinsicsPrior()
         self.position_prior: Prior | None = None
         self.orientation_prior: Prior | None = None
         self.gravity_prior: Prior | None = None
@@ -93,6 +108,15 @@ class View:
         return self._camera
 
     MutableCamera = Camera
+
+    def CameraIntrinsicsPrior(self) -> intrinsics.CameraIntrinsicsPrior:
+        return self._intrinsics_prior
+
+    MutableCameraIntrinsicsPrior = CameraIntrinsicsPrior
+
+    def SetCameraIntrinsicsPrior(self, prior: intrinsics.CameraIntrinsicsPrior) -> None:
+        """A copy of it."""
+        self._intrinsics_prior = deepcopy(prior)
 
     def SetPositionPrior(self, position: ArrayLike, sqrt_information: ArrayLike) -> None:
         self.position_prior = _prior(position, sqrt_information, "a position prior")
@@ -121,6 +145,16 @@ class View:
     def GetGravityPrior(self) -> Array:
         return _value(self.gravity_prior)
 
+    def GetPositionPriorSqrtInformation(self) -> Array:
+        """(3, 3), as set; the identity where there is no prior."""
+        return _root(self.position_prior)
+
+    def GetOrientationPriorSqrtInformation(self) -> Array:
+        return _root(self.orientation_prior)
+
+    def GetGravityPriorSqrtInformation(self) -> Array:
+        return _root(self.gravity_prior)
+
 
 class Feature:
     """Where a view sees a track: point (2,) px, and its covariance (2, 2) px^2."""
@@ -142,6 +176,10 @@ def vector(value: ArrayLike, size: int, what: str) -> Array:
 
 def _prior(value: ArrayLike, root: ArrayLike, what: str) -> Prior:
     return vector(value, 3, what), vector(root, 9, f"the root of the information of {what}").reshape(3, 3)
+
+
+def _root(prior: Prior | None) -> Array:
+    return np.eye(3) if prior is None else prior[1].copy()
 
 
 def _value(prior: Prior | None) -> Array:

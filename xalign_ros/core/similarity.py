@@ -17,21 +17,22 @@ TRIMMED_SIGMAS = 3.0
 COLLINEAR = 1e-12  # second over first singular value of the cross-covariance of points on one line
 
 
-def fit_similarity(x: ArrayLike, y: ArrayLike) -> Sim3:
-    """S_y_x that minimises sum |y - S_y_x x|^2 over corresponding points x, y (N, 3), each in its own unit.
+def fit_similarity(x: ArrayLike, y: ArrayLike, weights: ArrayLike | None = None) -> Sim3:
+    """S_y_x that minimises sum w |y - S_y_x x|^2 over corresponding points x, y (N, 3), each in its own unit.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (1991). Points in a
-    plane fix the rotation; points on a line leave the turn about it open, which is then the least possible one. Raises
-    ValueError on other shapes, fewer than two points, numbers that are not finite, and where all points of one set
-    coincide or the sets have nothing to do with each other.
+    plane fix the rotation; points on a line leave the turn about it open, which is then the least possible one. weights
+    (N,) are 1 by default. Raises ValueError on other shapes, fewer than two points, numbers that are not finite, negative
+    weights, and where all points of one set coincide or the sets have nothing to do with each other.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     if x.ndim != 2 or x.shape[1] != 3 or x.shape != y.shape or len(x) < 2:
         raise ValueError(f"a similarity needs two or more pairs of points (N, 3), not {x.shape} and {y.shape}")
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise ValueError("a point to fit a similarity to is not finite")
-    (x0, x_spread), (y0, y_spread) = _centred(x, "first"), _centred(y, "second")
-    M = ((y - y0) / y_spread).T @ ((x - x0) / x_spread)
+    w = None if weights is None else _normalised(weights, len(x))
+    (x0, x_spread), (y0, y_spread) = _centred(x, "first", w), _centred(y, "second", w)
+    M = ((y - y0) / y_spread * (1 if w is None else w[:, None])).T @ ((x - x0) / x_spread)
     R = _rotation(M)
     ratio = float(np.vdot(R, M)) / len(x)
     if not ratio > COLLINEAR:
@@ -73,10 +74,19 @@ def _from_triples(x: Array, y: Array, seed: int) -> Iterator[Sim3]:
             yield fit_similarity(x[three], y[three])
 
 
-def _centred(x: Array, which: str) -> tuple[Array, float]:
+def _normalised(weights: ArrayLike, count: int) -> Array:
+    """(N,) of mean 1."""
+    w = np.asarray(weights, float)
+    if w.shape != (count,) or not (np.isfinite(w).all() and (w >= 0).all() and (w > 0).sum() > 1):
+        raise ValueError(f"weights must be {count} numbers from 0 on, two of them above it")
+    return np.asarray(w / w.mean())
+
+
+def _centred(x: Array, which: str, w: Array | None) -> tuple[Array, float]:
     """Centroid (3,) and root mean square distance from it."""
-    centre = x.mean(axis=0)
-    spread = float(np.sqrt(((x - centre) ** 2).sum(axis=1).mean()))
+    centre = x.mean(axis=0) if w is None else (w[:, None] * x).mean(axis=0)
+    square = ((x - centre) ** 2).sum(axis=1)
+    spread = float(np.sqrt((square if w is None else w * square).mean()))
     if spread <= COINCIDENT * float(np.abs(x).max()):
         raise ValueError(f"all points of the {which} set coincide, which leaves scale and rotation open")
     return centre, spread
