@@ -154,3 +154,117 @@ def test_lenses_that_are_no_pinhole_are_refused_and_nothing_changes():
         ours.sfm.SetCameraIntrinsicsFromPriors(recon)
     with pytest.raises(ValueError, match="PriorVector2d has 2 finite numbers"):
         with_prior(ours, principal_point=[1.0])
+
+
+def test_least_squares_of_all_correspondences(theirs):
+    found = []
+    for pt in (ours, theirs):
+        pairs, _ = correspondences(pt, wrong=0)
+        start = so3_exp(np.array([0.01, 0, 0])) @ R_CW, CENTRE + 0.01
+        ok, R, position = pt.sfm.OptimizeAbsolutePoseOnNormFeatures(pairs, *start, pt.sfm.BundleAdjustmentOptions())
+        assert ok
+        found.append((R, position))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-5)
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-4)
+
+
+def seen(pt, focal=500.0, wrong=0.2, seed=0):
+    """Two estimated views of 100 points, and a third one that is not, some of whose features are elsewhere."""
+    rng, recon = np.random.default_rng(seed), pt.sfm.Reconstruction()
+    for k in range(3):
+        view, prior = recon.MutableView(recon.AddView(str(k), 0, float(k))), pt.sfm.CameraIntrinsicsPrior()
+        prior.image_width, prior.image_height = 640, 480
+        if focal:
+            prior.focal_length.value, prior.focal_length.is_set = [focal], True
+        view.SetCameraIntrinsicsPrior(prior)
+    if focal:
+        pt.sfm.SetCameraIntrinsicsFromPriors(recon)
+    poses = [(so3_exp(np.array([0, 0.05 * k, 0])), np.array([0.4 * k, 0, 0])) for k in range(3)]
+    for view, (R, c) in zip((recon.MutableView(k) for k in range(3)), poses, strict=True):
+        view.MutableCamera().SetOrientationFromRotationMatrix(R)
+        view.MutableCamera().SetPosition(c)
+        view.SetIsEstimated(True)
+    for X in rng.uniform([-1, -1, 4], [1, 1, 8], (100, 3)):
+        track = recon.AddTrack()
+        recon.MutableTrack(track).SetPoint(np.r_[X, 1])
+        recon.MutableTrack(track).SetIsEstimated(True)
+        for k in range(3):
+            uv = recon.View(k).Camera().ProjectPoint(np.r_[X, 1])[1] + rng.normal(0, 0.3, 2)
+            uv = uv + (rng.uniform(-200, 200, 2) if k == 2 and rng.random() < wrong else 0)
+            assert recon.AddObservation(k, track, pt.sfm.Feature(uv))
+    last = recon.MutableView(2)
+    last.SetIsEstimated(False)
+    last.MutableCamera().SetPosition([9, 9, 9])
+    return recon, poses[2]
+
+
+def a_summary(pt):
+    if pt is ours:
+        return pt.solvers.RansacSummary()
+    params = pt.solvers.RansacParameters()
+    params.error_thresh = 1.0
+    kinds = pt.sfm.RansacType(0), pt.sfm.PnPType.KNEIP
+    return pt.sfm.EstimateCalibratedAbsolutePose(params, *kinds, correspondences(pt)[0])[2]
+
+
+def test_a_view_is_localized(theirs):
+    for pt, wrong in ((ours, 0.0), (ours, 0.2), (theirs, 0.0)):  # pyTheia's adjustment takes wrong ones in again
+        recon, (R, c) = seen(pt, wrong=wrong)
+        assert pt.sfm.LocalizeViewToReconstruction(
+            2, pt.sfm.LocalizeViewToReconstructionOptions(), recon, a_summary(pt)
+        )
+        view = recon.View(2)
+        assert view.IsEstimated() and np.linalg.norm(view.Camera().GetPosition() - c) < 0.03
+        assert np.linalg.norm(so3_log(view.Camera().GetOrientationAsRotationMatrix() @ R.T)) < 0.01
+
+
+def test_a_view_that_is_not_localized_stays():
+    sfm, options = ours.sfm, ours.sfm.LocalizeViewToReconstructionOptions()
+    recon, _ = seen(ours, wrong=1.0)
+    summary = a_summary(ours)
+    assert not sfm.LocalizeViewToReconstruction(2, options, recon, summary)
+    assert not recon.View(2).IsEstimated() and recon.View(2).Camera().GetPosition().tolist() == [9, 9, 9]
+    assert summary.num_input_data_points == 100
+    with pytest.raises(ValueError, match="view 7 is not"):
+        sfm.LocalizeViewToReconstruction(7, options, recon, summary)
+    alone = ours.sfm.Reconstruction()
+    alone.AddView("a", 0.0)
+    with pytest.raises(ValueError, match="the focal length of view 'a' is not known"):
+        sfm.LocalizeViewToReconstruction(0, options, alone, summary)
+    options.assume_known_orientation = True
+    with pytest.raises(ValueError, match="assume_known_orientation"):
+        sfm.LocalizeViewToReconstruction(2, options, recon, summary)
+
+
+def test_tracks_that_are_none(theirs):
+    left = []
+    for pt in (ours, theirs):
+        recon, _ = seen(pt, seed=1)
+        for k, point in ((0, [0, 0, -5, 1]), (1, [0, 0, 900, 1]), (2, [0.3, 0, 5, 1])):
+            recon.MutableTrack(k).SetPoint(np.array(point, float))
+        far = recon.AddTrack()
+        recon.MutableTrack(far).SetPoint([0, 0, 900.0, 1])
+        recon.MutableTrack(far).SetIsEstimated(True)
+        for k in (0, 1):
+            recon.AddObservation(k, far, pt.sfm.Feature(recon.View(k).Camera().ProjectPoint([0, 0, 900.0, 1])[1]))
+        count = pt.sfm.SetOutlierTracksToUnestimated(set(recon.TrackIds()), 1.0, 1.0, recon)
+        gone = [k for k in sorted(recon.TrackIds()) if not recon.Track(k).IsEstimated()]
+        assert count == len(gone)
+        left.append(gone)
+    assert left[0] == left[1] == [0, 1, 2, 100]
+    with pytest.raises(ValueError, match="track 999 is not"):
+        ours.sfm.SetOutlierTracksToUnestimated({999}, 1.0, 1.0, seen(ours)[0])
+
+
+def test_what_a_camera_sees(theirs):
+    found = []
+    for pt in (ours, theirs):
+        recon, _ = seen(pt)
+        camera, view = recon.View(1).Camera(), recon.View(1)
+        depth, pixel = camera.ProjectPoint(np.array([2, 4, 10, 2.0]))
+        ray = camera.PixelToUnitDepthRay([100.0, 200])
+        found.append([depth, *pixel, *camera.PixelToNormalizedCoordinates([100.0, 200]), *(ray / np.linalg.norm(ray))])
+        found[-1] += [*camera.GetCalibrationMatrix().ravel(), *camera.GetProjectionMatrix().ravel()]
+        found[-1] += [view.NumFeatures(), *view.GetFeature(7).point, *sorted(view.TrackIds())]
+        assert camera.ProjectPoint(np.array([0, 0, -5, 1.0]))[0] < 0
+    np.testing.assert_allclose(*found)

@@ -10,6 +10,7 @@ from xalign_ros.compat import (
     pytheia_adjuster,
     pytheia_bundle,
     pytheia_bundle_options,
+    pytheia_calibrated_pose,
     pytheia_clouds,
     pytheia_intrinsics,
     pytheia_localization,
@@ -28,6 +29,7 @@ sfm = SimpleNamespace(
             pytheia_adjuster,
             pytheia_bundle,
             pytheia_bundle_options,
+            pytheia_calibrated_pose,
             pytheia_clouds,
             pytheia_intrinsics,
             pytheia_localization,
@@ -42,5 +44,5 @@ sfm = SimpleNamespace(
     }
 )
 solvers = SimpleNamespace(
-    RansacParameters=pytheia_localization.RansacParameters, RansacSummary=pytheia_localization.RansacSummary
+    RansacParameters=pytheia_calibrated_pose.RansacParameters, RansacSummary=pytheia_calibrated_pose.RansacSummary
 )

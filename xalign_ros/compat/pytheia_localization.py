@@ -1,127 +1,128 @@
-"""pyTheia's absolute pose and the intrinsics of reconstructions from their priors, over our PnP."""
+"""pyTheia's localization of a view in a reconstruction, tracks that are none, and intrinsics from their priors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from enum import IntEnum
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from xalign_ros.compat.pytheia_reconstruction import Reconstruction
-from xalign_ros.compat.pytheia_views import View, vector
-from xalign_ros.core.camera import Camera
-from xalign_ros.core.config import Pnp
-from xalign_ros.core.lie import Array
-from xalign_ros.core.pnp import Points2D3D, estimate_pose
+from xalign_ros.compat.pytheia_bundle_options import BundleAdjustmentOptions
+from xalign_ros.compat.pytheia_calibrated_pose import (
+    EstimateCalibratedAbsolutePose,
+    FeatureCorrespondence2D3D,
+    PnPType,
+    RansacParameters,
+    RansacSummary,
+    RansacType,
+)
+from xalign_ros.compat.pytheia_reconstruction import Reconstruction, Track
+from xalign_ros.compat.pytheia_views import Camera, View
 
 __all__ = [
-    "CalibratedAbsolutePose",
-    "EstimateCalibratedAbsolutePose",
-    "FeatureCorrespondence2D3D",
-    "PnPType",
-    "RansacType",
+    "LocalizeViewToReconstruction",
+    "LocalizeViewToReconstructionOptions",
     "SetCameraIntrinsicsFromPriors",
+    "SetOutlierTracksToUnestimated",
 ]
 
-PnPType = IntEnum("PnPType", "KNEIP SQPnP DLS MLPnP", start=0)
-RansacType = IntEnum("RansacType", "RANSAC PROSAC LMED EXHAUSTIVE", start=0)
-FOCAL_PX = 1000.0  # of the pinhole that normalised coordinates are pixels of
-THRESHOLD_SIGMAS = 3.0
-FEWEST = 6  # that agree: three fix a pose, and chance agrees on some more
-UNBOUNDED_ITERATIONS = 100_000
+IMAGE_PX = 1024  # the larger side of an image whose threshold is as it is given
 
 
 @dataclass(eq=False, slots=True)
-class RansacParameters:
-    """error_thresh: squared, in normalised coordinates. Sampling is seeded, locally optimised, and always refined."""
+class LocalizeViewToReconstructionOptions:
+    """The threshold is that of an image of 1024 px. bundle_adjust_view and ba_options change nothing: it is refined."""
 
-    error_thresh: float = -1.0
-    failure_probability: float = 0.01
-    lo_start_iterations: int = 50
-    max_iterations: int = 2**31 - 1
-    min_inlier_ratio: float = 0.0
-    min_iterations: int = 100
-    use_Tdd_test: bool = False
-    use_lo: bool = False
-    use_mle: bool = False
-    use_sturm_5pt: bool = True
-    rng: object = None
+    reprojection_error_threshold_pixels: float = 4.0
+    assume_known_orientation: bool = False
+    ransac_params: RansacParameters = field(default_factory=RansacParameters)
+    bundle_adjust_view: bool = True
+    ba_options: BundleAdjustmentOptions = field(default_factory=BundleAdjustmentOptions)
+    min_num_inliers: int = 30
+    pnp_type: PnPType = PnPType.DLS
 
 
-@dataclass(eq=False, slots=True)
-class RansacSummary:
-    inliers: list[int] = field(default_factory=list)
-    num_input_data_points: int = 0
-    num_iterations: int = 0
-    confidence: float = 0.0
-    num_lo_iterations: int = 0
+def LocalizeViewToReconstruction(
+    view_id: int, options: LocalizeViewToReconstructionOptions, reconstruction: Reconstruction, summary: RansacSummary
+) -> bool:
+    """Whether the view's pose was found by the estimated tracks that it sees; then it has it and is estimated.
 
-
-class FeatureCorrespondence2D3D:
-    """feature (2,), normalised, and world_point (3,)."""
-
-    def __init__(self, feature: ArrayLike = (0, 0), world_point: ArrayLike = (0, 0, 0)) -> None:
-        self.feature = vector(feature, 2, "a feature")
-        self.world_point = vector(world_point, 3, "a world point")
-
-
-@dataclass(eq=False, slots=True)
-class CalibratedAbsolutePose:
-    """rotation (3, 3) world to camera, position (3,) of the camera in the world; cov_cam (6, 6), ours, or None.
-
-    The covariance is of the right tangent of T_world_cam, rotation before translation.
+    Its intrinsics are those of its prior, or of an estimated view of its group. `summary` gets the sampling's. Raises
+    ValueError on a view that is not there, intrinsics that nobody knows and assume_known_orientation.
     """
+    view = reconstruction.View(view_id)
+    if view is None:
+        raise ValueError(f"view {view_id} is not in the reconstruction")
+    if options.assume_known_orientation:
+        raise ValueError("assume_known_orientation has no counterpart; leave it out")
+    camera = _known_camera(view_id, view, reconstruction)
+    tracks = [(reconstruction.Track(k), feature) for k, feature in view.features.items()]
+    pairs = [
+        FeatureCorrespondence2D3D(camera.PixelToNormalizedCoordinates(f.point)[:2], t.Point()[:3] / t.Point()[3])
+        for t, f in tracks
+        if t is not None and t.IsEstimated() and t.Point()[3] != 0
+    ]
+    size = max(camera.size) or IMAGE_PX
+    threshold_px = options.reprojection_error_threshold_pixels * size / IMAGE_PX
+    params = replace(options.ransac_params, error_thresh=(threshold_px / camera.FocalLength()) ** 2)
+    found, pose, told = EstimateCalibratedAbsolutePose(params, RansacType.RANSAC, options.pnp_type, pairs)
+    for name in RansacSummary.__slots__:
+        setattr(summary, name, getattr(told, name))
+    if not found or len(told.inliers) < options.min_num_inliers:
+        return False
+    own = view.MutableCamera()
+    own.intrinsics, own.size = camera.intrinsics.copy(), camera.size
+    own.SetOrientationFromRotationMatrix(pose.rotation)
+    own.SetPosition(pose.position)
+    view.SetIsEstimated(True)
+    return True
 
-    rotation: Array = field(default_factory=lambda: np.eye(3))
-    position: Array = field(default_factory=lambda: np.zeros(3))
-    cov_cam: Array | None = None
+
+def _known_camera(view_id: int, view: View, reconstruction: Reconstruction) -> Camera:
+    if view.CameraIntrinsicsPrior().focal_length.is_set:
+        camera = Camera()
+        camera.SetFromCameraIntrinsicsPriors(view.CameraIntrinsicsPrior())
+        return camera
+    group = reconstruction.CameraIntrinsicsGroupIdFromViewId
+    for other_id in reconstruction.ViewIds():
+        other = reconstruction.View(other_id)
+        if other is not None and other is not view and other.IsEstimated() and group(other_id) == group(view_id):
+            return other.Camera()
+    raise ValueError(f"the focal length of view {view.Name()!r} is not known; set its prior")
 
 
-def EstimateCalibratedAbsolutePose(
-    ransac_params: RansacParameters,
-    ransac_type: RansacType,
-    pnp_type: PnPType,
-    correspondences: Sequence[FeatureCorrespondence2D3D],
-) -> tuple[bool, CalibratedAbsolutePose, RansacSummary]:
-    """(found, pose, summary): the pose that most correspondences agree on, refined on them.
-
-    One minimal solver and one robust estimator stand for all of theirs. Raises ValueError on a threshold that is not
-    positive and on LMED and EXHAUSTIVE, which have none.
+def SetOutlierTracksToUnestimated(
+    track_ids: Iterable[int], max_reprojection_error_px: float, min_angle_deg: float, reconstruction: Reconstruction
+) -> int:
+    """How many of the estimated tracks named are no more: with a root mean square reprojection error above that, behind a
+    view that sees them, or with no two rays as far apart as that. Raises ValueError on an id that is not there.
     """
-    if not ransac_params.error_thresh > 0:
-        raise ValueError(f"error_thresh is {ransac_params.error_thresh:g}; it must be a positive square")
-    if RansacType(ransac_type) not in (RansacType.RANSAC, RansacType.PROSAC):
-        raise ValueError(f"{RansacType(ransac_type).name} has no counterpart; take RANSAC")
-    PnPType(pnp_type)
-    uv = np.array([c.feature for c in correspondences], float).reshape(-1, 2)
-    xyz = np.array([c.world_point for c in correspondences], float).reshape(-1, 3)
-    if not (np.isfinite(uv).all() and np.isfinite(xyz).all()):
-        raise ValueError("a correspondence has a number that is not finite")
-    count, threshold = len(uv), float(np.sqrt(ransac_params.error_thresh))
-    summary = RansacSummary(num_input_data_points=count)
-    fewest = max(FEWEST, int(np.ceil(ransac_params.min_inlier_ratio * count)))
-    config = Pnp(
-        min_inliers=fewest,
-        min_spread=0.0,
-        threshold_sigmas=THRESHOLD_SIGMAS,
-        iterations=min(ransac_params.max_iterations, UNBOUNDED_ITERATIONS),
-        max_rms_sigmas=np.inf,
-        max_sigma_ratio=np.inf,
-    )
-    sigma_px = np.full(count, FOCAL_PX * threshold / THRESHOLD_SIGMAS)
-    camera = Camera("radtan", np.array([FOCAL_PX, FOCAL_PX, 0.0, 0.0]), np.zeros(0), 1, 1)
-    found = estimate_pose(Points2D3D(FOCAL_PX * uv, sigma_px, xyz, np.zeros((count, 3, 3))), camera, 0, config)
-    if isinstance(found, str):
-        return False, CalibratedAbsolutePose(), summary
-    T = found.T_map_cam
-    x = (xyz - T.t) @ T.R
-    with np.errstate(divide="ignore", invalid="ignore"):
-        error = ((x[:, :2] / x[:, 2:] - uv) ** 2).sum(axis=1)
-    inliers = np.flatnonzero((x[:, 2] > 0) & (error < ransac_params.error_thresh))
-    summary.inliers, summary.confidence = inliers.tolist(), 1 - ransac_params.failure_probability
-    return len(inliers) >= fewest, CalibratedAbsolutePose(T.R.T.copy(), T.t.copy(), found.cov_cam), summary
+    count = 0
+    for track_id in sorted(set(track_ids)):
+        track = reconstruction.Track(track_id)
+        if track is None:
+            raise ValueError(f"track {track_id} is not in the reconstruction")
+        if track.IsEstimated() and _is_outlier(track, max_reprojection_error_px, min_angle_deg, reconstruction):
+            track.SetIsEstimated(False)
+            count += 1
+    return count
+
+
+def _is_outlier(track: Track, max_px: float, min_deg: float, reconstruction: Reconstruction) -> bool:
+    errors, rays = [], []
+    for view_id, feature in track.features.items():
+        view = reconstruction.View(view_id)
+        if view is not None and view.IsEstimated():
+            depth, pixel = view.Camera().ProjectPoint(track.Point())
+            if not depth > 0:
+                return True
+            errors.append(((pixel - feature.point) ** 2).sum())
+            ray = view.Camera().PixelToUnitDepthRay(feature.point)
+            rays.append(ray / np.linalg.norm(ray))
+    if not rays or np.mean(errors) > max_px**2:
+        return True
+    nearest = np.array(rays) @ np.array(rays).T
+    return bool(nearest.min() > np.cos(np.deg2rad(min_deg)))
 
 
 def SetCameraIntrinsicsFromPriors(reconstruction: Reconstruction) -> None:

@@ -129,7 +129,7 @@ class Reconstruction:
             return False
         self._tracks[track_id].AddView(view_id)
         if feature is not None:
-            self._tracks[track_id].features[view_id] = feature
+            self._tracks[track_id].features[view_id] = self._views[view_id].features[track_id] = feature
         return True
 
     def Track(self, track_id: int) -> Track | None:

@@ -81,12 +81,37 @@ class Camera:
             getattr(prior, name).value, getattr(prior, name).is_set = value, True
         return prior
 
+    def GetCalibrationMatrix(self) -> Array:
+        fx, fy, cx, cy = self.intrinsics.tolist()
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+    def GetProjectionMatrix(self) -> Array:
+        """(3, 4), to homogeneous pixels."""
+        R = self._rotation
+        return np.asarray(self.GetCalibrationMatrix() @ np.c_[R, -R @ self._position])
+
+    def ProjectPoint(self, point: ArrayLike) -> tuple[float, Array]:
+        """Depth and pixel (2,) of a homogeneous point (4,); behind the camera the depth is negative."""
+        X = vector(point, 4, "a point (homogeneous)")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = self._rotation @ (X[:3] / X[3] - self._position)
+            return float(x[2]), self.intrinsics[:2] * x[:2] / x[2] + self.intrinsics[2:]
+
+    def PixelToNormalizedCoordinates(self, pixel: ArrayLike) -> Array:
+        """(3,) in the camera's axes, with z = 1."""
+        return np.append((vector(pixel, 2, "a pixel") - self.intrinsics[2:]) / self.intrinsics[:2], 1.0)
+
+    def PixelToUnitDepthRay(self, pixel: ArrayLike) -> Array:
+        """The same in the world's axes."""
+        return np.asarray(self._rotation.T @ self.PixelToNormalizedCoordinates(pixel))
+
 
 class View:
     """With priors of position (world), orientation (angle-axis, world to camera) and gravity (camera), or None."""
 
     def __init__(self, name: str, timestamp: float = 0.0) -> None:
         self._name, self._timestamp, self._estimated, self._camera = name, timestamp, False, Camera()
+        self.features: dict[int, Feature] = {}  # by track
         self._intrinsics_prior = intrinsics.CameraIntrinsicsPrior()
         self.position_prior: Prior | None = None
         self.orientation_prior: Prior | None = None
@@ -108,6 +133,15 @@ class View:
         return self._camera
 
     MutableCamera = Camera
+
+    def GetFeature(self, track_id: int) -> Feature | None:
+        return self.features.get(track_id)
+
+    def TrackIds(self) -> list[int]:
+        return list(self.features)
+
+    def NumFeatures(self) -> int:
+        return len(self.features)
 
     def CameraIntrinsicsPrior(self) -> intrinsics.CameraIntrinsicsPrior:
         return self._intrinsics_prior
