@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xalign_ros.compat import pytheia as pt
+from xalign_ros.core.bundle import adjust, covariances
 from xalign_ros.core.bundle_factors import priors_at, root_of
 from xalign_ros.core.config import Config
 from xalign_ros.core.lie import so3_exp
@@ -105,6 +106,58 @@ def test_a_prior_weighs_an_error_as_its_anchor_does(seed) -> None:
         assert float((r**2).sum()) == pytest.approx(want, rel=1e-6)
     half = priors_of_anchors(np.array([0]), {0: anchor}, 0.5)
     np.testing.assert_allclose(2 * half.t_information, priors.t_information)
+
+
+@given(st.integers(0, 10_000))
+def test_priors_cost_in_bundle_adjustment_what_the_covariance_of_their_anchors_says(seed) -> None:
+    """Of views that are turned and moved at once, where the covariance does not tie the two; and their share of it."""
+    rng, n = np.random.default_rng(seed), 3
+    A = rng.normal(size=(n, 2, 3, 3))
+    A = A @ A.swapaxes(2, 3) + 0.1 * np.eye(3)
+    cov = np.zeros((n, 6, 6))
+    cov[:, :3, :3], cov[:, 3:, 3:] = A[:, 0], A[:, 1]
+    T = [SE3.exp(rng.normal(size=6)) for _ in range(n)]
+    anchors = {k: Anchor(k, 0, k, T[k], cov[k], 50, 40, 1.0) for k in range(n)}
+    d = rng.normal(0, 0.8, (n, 6))  # right tangents, rotations up to two radians
+    moved = [SE3(x.R @ so3_exp(e[:3]), x.t + x.R @ e[3:]) for x, e in zip(T, d, strict=True)]
+    want = 0.5 * sum(e @ np.linalg.solve(c, e) for e, c in zip(d, cov, strict=True))
+    run = Reconstruction.of_views(np.array([x.R for x in moved]), np.array([x.t for x in moved]))
+    for share in (1.0, 0.3):
+        there = replace(run, priors=priors_of_anchors(np.arange(n), anchors, share))
+        done = adjust(there)
+        assert done.initial_cost == pytest.approx(share * want, rel=1e-9)
+        assert done.converged and done.cost < 1e-9 * done.initial_cost
+        np.testing.assert_allclose(done.reconstruction.t, [x.t for x in T], atol=1e-5)
+        np.testing.assert_allclose(covariances(done.reconstruction).views, cov / share, rtol=1e-3, atol=1e-4)
+
+
+@given(st.integers(0, 10_000))
+def test_pytheias_anchors_cost_as_priors_what_they_cost_in_its_pose_graph(seed) -> None:
+    """A view that is moved; and one at the origin that is turned, by 2 sin(a / 2) there and a here. Elsewhere its edge sees
+    a turn as a move, too, and depends on the frame."""
+    rng, weight = np.random.default_rng(seed), float(np.random.default_rng(seed).uniform(0.5, 30))
+    R, c, u, w = so3_exp(rng.normal(size=3)), rng.normal(0, 5, 3), rng.normal(size=3), rng.normal(0, 0.3, 3)
+    angle = np.linalg.norm(w)
+    for (R_now, c_now), (R_anchor, c_anchor), ratio in (
+        ((R, c + u), (R, c), 1.0),
+        ((R @ so3_exp(w), 0 * c), (R, 0 * c), (2 * np.sin(angle / 2) / angle) ** 2),
+    ):
+        recon = pt.sfm.Reconstruction()
+        view = recon.View(recon.AddView("a", 0.0))
+        view.SetIsEstimated(True)
+        view.Camera().SetPosition(c_now)
+        view.Camera().SetOrientationFromRotationMatrix(R_now)
+        edge = pt.sfm.CrossViewAnchorEdge(
+            0, pt.sfm.Sim3FromRotationTranslationScale(R_anchor, -R_anchor @ c_anchor, 1.0), weight
+        )
+        options = pt.sfm.CrossReconstructionPoseGraphOptions(huber_delta_anchor=0.0)
+        optimizer = pt.sfm.CrossReconstructionSim3PoseGraphOptimizer(options)
+        optimizer.set_variable_reconstruction(recon, [0])
+        optimizer.add_cross_view_edge(edge)
+        _, summary = optimizer.optimize()
+        run = Reconstruction.of_views(R_now.T[None], c_now[None])
+        done = adjust(replace(run, priors=pt.sfm.PosePriorsFromAnchorEdges([edge], {0: 0})))
+        assert summary.initial_cost == pytest.approx(ratio * done.initial_cost, rel=1e-9)
 
 
 def test_pytheias_anchor_as_a_prior_is_where_the_view_would_be_written() -> None:

@@ -22,7 +22,8 @@ DOWN = (0.0, 0.0, -1.0)
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-10, 1e12
 GAUSS_NEWTON = 1e-6  # damping up to which steps are not held back
 LEFT = 3e-7  # of the cost: done when less is to be gained,
-NOTHING = 1e-8  # or less was gained
+NOTHING = 1e-8  # or less was gained,
+ZERO = 1e-24  # or so little of the first cost is left that it is rounding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +84,7 @@ def adjust(
             gains.append(at.cost - there.cost)
             more = _to_gain(*gains[-3:]) if damping <= GAUSS_NEWTON else np.inf
             converged = gains[-1] <= NOTHING * there.cost or more <= LEFT * there.cost
+            converged |= there.cost <= ZERO * problem.start.cost
             at, damping = there, max(damping / 10, LEAST_DAMPING)
     m, skipped = len(problem.observations), problem.skipped + int(at.reprojections.lost.sum())
     return Bundled(problem.told(at), problem.start.cost, at.cost, iterations, converged, m, skipped)
