@@ -275,6 +275,8 @@ def run(args: argparse.Namespace) -> None:
         raise ConfigError("with --live the options are the node's parameters: give --config and --set to the node")
     if args.source != "keyframes":
         raise ConfigError("--live plays keyframes; for another --source give the node that source, and play the bag")
+    if args.copy_inputs:
+        raise ConfigError("--live plays into the graph and copies nothing: record it with ros2 bag")
     if not (args.rate >= 0 and math.isfinite(args.rate)):
         raise ConfigError(f"--rate is {args.rate}; it is the speed of the log's time, 0 for as fast as it goes")
     map_ = read_map(args.map, verify=True)

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from xalign_ros.core.aligner import Aligner
+from xalign_ros.core.errors import ConfigError
 from xalign_ros.io.adapter_log import Chosen, add_source_arguments, log_keyframes, read_source
 from xalign_ros.io.config_file import read_config
 from xalign_ros.io.log import Log, typestore
@@ -23,8 +24,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="LOG", help="mcap file, rosbag2 folder or rosbag1 file")
     parser.add_argument("--map", type=Path, required=True, metavar="MAP", help="reference map (.xmap folder)")
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="OUT.mcap", help="log of corrections, anchors, states, poses"
+        "-o",
+        "--output",
+        type=Path,
+        metavar="OUT.mcap",
+        help="log of corrections, anchors, states, poses; another name than *.mcap is a rosbag2 folder",
     )
+    parser.add_argument("--copy-inputs", action="store_true", help="-o also gets all that LOG holds")
     told = "poses as known at each keyframe's own time: TUM, or by its ending .csv (EuRoC) or .kitti"
     parser.add_argument("--trajectory", type=Path, metavar="OUT.tum", help=told)
     parser.add_argument("--truth", type=Path, metavar="TUM_FILE", help="true T_map_cam; adds the errors to the result")
@@ -44,6 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Raises XalignError on bad input; what it has written by then is gone."""
     check_report(args.report, [args.log, args.map, args.truth, args.config, args.output, args.trajectory])
+    if args.copy_inputs and not args.output:
+        raise ConfigError("--copy-inputs copies into the log of -o, which is not given")
     config = read_config(args.config, args.set)
     source, chosen = read_source(args), Chosen(args.keyframe_topic, args.image_topic)
     map_ = read_map(args.map, verify=True)
@@ -52,15 +60,17 @@ def run(args: argparse.Namespace) -> None:
     with ExitStack() as stack:
         log = stack.enter_context(Log(args.log))
         keyframes = log_keyframes(log, source, config.selection, map_, chosen)
-        output = OutputLog(args.output, stack)
+        output = OutputLog(args.output, stack, log if args.copy_inputs else None)
         frame = "odom"
-        for _, keyframe, fault in keyframes:
+        for arrival_ns, keyframe, fault in keyframes:
             start = time.perf_counter()
             step = aligner.step(keyframe, fault)
             record.add(step, time.perf_counter() - start, keyframe.T_odom_cam if keyframe is not None else None)
             frame = keyframe.odom_frame if keyframe is not None else frame
+            output.copy(arrival_ns)
             if args.output:
                 output.write(step_messages(types, step, map_, frame), step.stamp_ns)
+        output.copy()
     digest = correction_digest(correction_fields(s.correction) for s in record.steps if s.correction is not None)
     result = write_results(
         record, digest, truth, map_, trajectory=args.trajectory, report=args.report, title=args.log.name

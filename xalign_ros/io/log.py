@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import heapq
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from operator import itemgetter
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import zstandard
-from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, ConnectionExtRosbag2, MessageDefinitionFormat
+from rosbags.rosbag2.metadata import dump_qos_v8
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.typesys.store import Typestore
 
@@ -25,26 +23,14 @@ from xalign_ros.io.keyframe_cdr import keyframe_fields_from_cdr
 from xalign_ros.io.keyframe_fields import KeyframeFields, keyframe_of
 from xalign_ros.io.log_files import reader_for, stored, translated, words
 from xalign_ros.io.log_types import defined, deserialized, typestore
+from xalign_ros.io.log_writer import LogFolder, LogWriter, Source, qos
 from xalign_ros.io.mcap_file import McapFile
 from xalign_ros.io.messages import KEYFRAME, keyframe_fields
 
-__all__ = ["Log", "LogWriter", "RawMessage", "Topic", "typestore"]
+__all__ = ["Log", "LogFolder", "LogWriter", "RawMessage", "Topic", "typestore"]
 
+ENCODINGS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 LISTED = 12  # topics named in an error
-FOREVER = "sec: 9223372036\n    nsec: 854775807"
-# As the recorder writes it up to metadata version 8, the form which every later version reads too.
-QOS = f"""- history: 1
-  depth: {{depth}}
-  reliability: 1
-  durability: {{durability}}
-  deadline:
-    {FOREVER}
-  lifespan:
-    {FOREVER}
-  liveliness: 1
-  liveliness_lease_duration:
-    {FOREVER}
-  avoid_ros_namespace_conventions: false"""
 
 
 class Topic(NamedTuple):
@@ -164,6 +150,24 @@ class Log:
                 raise self._named(error, connection, time_ns) from error
             yield RawMessage(connection.topic, connection.msgtype, time_ns, bytes(cdr))
 
+    def sources(self) -> list[Source]:
+        """What a copy of each topic needs to know; of ROS 1 the types as ROS 2 writes them."""
+        found: dict[tuple[str, str], Source] = {}
+        for storage in self._storages:
+            for c in storage.connections:
+                found.setdefault((c.topic, c.msgtype), Source(c.topic, c.msgtype, *self._definition(c), _qos(c)))
+        return [found[key] for key in sorted(found)]
+
+    def _definition(self, connection: Connection) -> tuple[str, str, str]:
+        """Encoding, text and hash of a type."""
+        form, text, kind = connection.msgdef.format, connection.msgdef.data, connection.msgtype
+        old, ours = isinstance(connection.ext, ConnectionExtRosbag1), kind in typestore().fielddefs
+        if ours and (old or not text.strip()):
+            return "ros2msg", typestore().generate_msgdef(kind, ros_version=2)[0], typestore().hash_rihs01(kind)
+        if old:
+            return "ros2msg", self._store(connection).generate_msgdef(kind, ros_version=2)[0], ""
+        return ENCODINGS.get(form, "") if text.strip() else "", text, connection.digest
+
     def _read(self, wanted: set[tuple[str, str]]) -> Iterator[tuple[Connection, int, bytes]]:
         streams = []
         for storage in self._storages:
@@ -218,67 +222,16 @@ class Log:
         return ", ".join(told[:LISTED]) + more if told else "no topics at all"
 
 
+def _qos(connection: Connection) -> str:
+    if isinstance(connection.ext, ConnectionExtRosbag1):
+        return qos(bool(connection.ext.latching))
+    if isinstance(connection.owner, McapFile):
+        return connection.owner.qos(connection.id)
+    return dump_qos_v8(connection.ext.offered_qos_profiles)
+
+
 def _counts(connections: Iterable[Connection]) -> dict[tuple[str, str], int]:
     counts: Counter[tuple[str, str]] = Counter()
     for c in connections:
         counts[c.topic, c.msgtype] += c.msgcount
     return dict(counts)
-
-
-class LogWriter:
-    """An MCAP file in the making, as context manager: it gets its name only when all went well.
-
-    Topics in `latched` are told as transient local. Same calls, same bytes. Raises LogError where it cannot be written.
-    """
-
-    def __init__(self, path: str | Path, latched: Iterable[str] = ("state",)) -> None:
-        self.path = Path(path)
-        self._temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
-        self._latched = frozenset(latched)
-        self._channels: dict[tuple[str, str], int] = {}
-        self._written: Counter[int] = Counter()
-
-    def __enter__(self) -> LogWriter:
-        with self._writing():
-            self._file = self._temporary.open("wb")
-        self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
-        self._mcap.start(profile="ros2", library="xalign")
-        return self
-
-    def channel(self, topic: str, typename: str) -> int:
-        """Makes `topic` known, even if nothing is ever written to it."""
-        if (topic, typename) not in self._channels:
-            text = typestore().generate_msgdef(typename, ros_version=2)[0].encode()
-            schema = self._mcap.register_schema(typename, "ros2msg", text)
-            latched = topic in self._latched
-            qos = QOS.format(depth=1 if latched else 10, durability=1 if latched else 2)
-            metadata = {"offered_qos_profiles": qos, "topic_type_hash": typestore().hash_rihs01(typename)}
-            self._channels[topic, typename] = self._mcap.register_channel(topic, "cdr", schema, metadata)
-        return self._channels[topic, typename]
-
-    def write(self, topic: str, typename: str, message: Any, log_time_ns: int) -> None:
-        """Appends a message of the classes in `typestore()`."""
-        channel = self.channel(topic, typename)
-        data = bytes(typestore().serialize_cdr(message, typename))
-        with self._writing():
-            self._mcap.add_message(channel, log_time_ns, data, log_time_ns, self._written[channel])
-        self._written[channel] += 1
-
-    def __exit__(self, kind: type[BaseException] | None, error: object, where: TracebackType | None) -> None:
-        try:
-            with self._writing(), self._file:
-                if kind is None:
-                    self._mcap.finish()
-            if kind is None:
-                with self._writing():
-                    os.replace(self._temporary, self.path)
-        finally:
-            with suppress(OSError):
-                self._temporary.unlink()
-
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise LogError(f"{self.path} cannot be written: {error.strerror or error}") from error

@@ -85,6 +85,10 @@ class McapFile:
                 yield copied(pending[k])
             del pending[:ready]
 
+    def qos(self, channel: int) -> str:
+        """The offered profiles as the recorder wrote them; "" where it did not."""
+        return str(self._channels[channel].metadata.get("offered_qos_profiles", ""))
+
     # -- what there is -------------------------------------------------------------------------------------------
 
     def _summary(self) -> tuple[int, int] | None:
@@ -179,7 +183,8 @@ class McapFile:
         form = FORMATS.get(schema.encoding, MessageDefinitionFormat.NONE) if schema else MessageDefinitionFormat.NONE
         text = schema.data.decode(errors="replace") if schema and form is not MessageDefinitionFormat.NONE else ""
         name, told = schema.name if schema else "", ConnectionExtRosbag2(channel.message_encoding, [])
-        return Connection(channel.id, channel.topic, name, MessageDefinition(form, text), "", count, told, self)
+        digest = channel.metadata.get("topic_type_hash", "")
+        return Connection(channel.id, channel.topic, name, MessageDefinition(form, text), digest, count, told, self)
 
     # -- bytes ---------------------------------------------------------------------------------------------------
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +16,7 @@ from xalign_ros.core.evaluation import summarize, summarize_errors
 from xalign_ros.core.records import Step
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3
-from xalign_ros.io.log import LogWriter
+from xalign_ros.io.log import Log, LogFolder, LogWriter, RawMessage
 from xalign_ros.io.step_messages import TOPICS
 from xalign_ros.io.trajectory_files import write_trajectory
 from xalign_ros.io.tum import Trajectory, pose_at, read_tum
@@ -36,19 +37,42 @@ class Run:
 
 
 class OutputLog:
-    """The output log, open while the run goes on; nothing remains of it if the run fails. Without a path: nothing."""
+    """The output log, open while the run goes on; nothing remains of it if the run fails. Without a path: nothing.
 
-    def __init__(self, path: Path | None, stack: ExitStack) -> None:
-        self._log = stack.enter_context(LogWriter(path)) if path else None
+    An MCAP file by its ending, else a rosbag2 folder. With `inputs` it also gets what they hold, except topics of the
+    names that the run itself writes.
+    """
+
+    def __init__(self, path: Path | None, stack: ExitStack, inputs: Log | None = None) -> None:
+        make = LogWriter if path is None or path.suffix.lower() == ".mcap" else LogFolder
+        self._log = stack.enter_context(make(path)) if path else None
+        self._inputs: Iterator[RawMessage] = iter(())
+        self._channels: dict[tuple[str, str], int] = {}
         if self._log:
             for topic, name in TOPICS.items():
                 self._log.channel(topic, name)
+        if self._log and inputs:
+            ours = [s for s in inputs.sources() if s.topic.strip("/") in TOPICS]
+            self._channels = {(s.topic, s.type): self._log.copied(s) for s in inputs.sources() if s not in ours}
+            self._inputs = inputs.raw_messages({topic for topic, _ in self._channels})
+            if ours:
+                names = ", ".join(s.topic for s in ours)
+                print(f"{path} gets this run's own topics, the log's are not copied: {names}", file=sys.stderr)
+        self._next = next(self._inputs, None)
 
     def write(self, messages: Mapping[str, Any], stamp_ns: int) -> None:
         """A step's messages (rosbags classes) by topic."""
         if self._log:
             for topic, message in messages.items():
                 self._log.write(topic, TOPICS[topic], message, stamp_ns)
+
+    def copy(self, until_ns: int | None = None) -> None:
+        """The inputs up to this log time, or all that are left."""
+        while self._log and self._next and (until_ns is None or self._next.log_time_ns <= until_ns):
+            key = self._next.topic, self._next.type
+            if key in self._channels:
+                self._log.write_bytes(self._channels[key], self._next.data, self._next.log_time_ns)
+            self._next = next(self._inputs, None)
 
 
 def read_truth(path: Path | None) -> Trajectory | None:
