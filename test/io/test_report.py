@@ -36,7 +36,7 @@ from xalign_ros.core.records import (
     INPUT_REASONS,
     State,
 )
-from xalign_ros.io import report, report_pictures, report_run
+from xalign_ros.io import report, report_pictures, report_run, report_style
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ RUNS = {
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", RUNS)
 def test_runs_out_of_the_ordinary(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(report_pictures, "STYLE", report_pictures.STYLE.replace(f"dpi={report_pictures.DPI}", "dpi=60"))
+    monkeypatch.setattr(report_style, "STYLE", report_style.STYLE.replace(f"dpi={report_style.DPI}", "dpi=60"))
     run, truth, words = RUNS[name]
     write(tmp_path / "out", run, truth=truth)
     have = {p.name for p in (tmp_path / "out").iterdir()}

@@ -16,7 +16,7 @@ from report_samples import (
 
 from xalign_ros.core.records import Rejection
 from xalign_ros.core.transforms import SE3
-from xalign_ros.io import report, report_pictures, report_run
+from xalign_ros.io import report, report_pictures, report_run, report_style
 
 
 def test_a_stamp_that_goes_backwards_does_not_turn_time_back():
@@ -67,7 +67,7 @@ def test_top_view_names_what_it_shows():
 
 @pytest.mark.parametrize("draw", [draw for draw, _ in report.PICTURES.values()])
 def test_the_legend_covers_no_data_and_nothing_leaves_the_picture(draw):
-    with matplotlib.rc_context(dict(item.split("=") for item in report_pictures.STYLE.split())):
+    with matplotlib.rc_context(dict(item.split("=") for item in report_style.STYLE.split())):
         figure = draw(report_run.Run(*a_run(), a_map()))
         figure.draw_without_rendering()
     legend = figure.legends[0].get_window_extent()

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import tempfile
-from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from xalign_ros.core.errors import FormatError
 from xalign_ros.core.records import State, Step
 from xalign_ros.core.reference_map import ReferenceMap
-from xalign_ros.io.report_page import PAGE
+from xalign_ros.io.report_page import filled, picture, write_folder
 from xalign_ros.io.report_pictures import (
     PICTURES,
     REASONS,
@@ -22,7 +18,6 @@ from xalign_ros.io.report_pictures import (
 )
 from xalign_ros.io.report_run import Poses, Run
 
-MARK = '<meta name="generator" content="xalign_ros report">'
 FIGURES = {  # key of the result, nested ones dotted: unit and meaning; {m} is the map's unit of length
     "keyframes": ("", "keyframes received"),
     "anchors_accepted": ("", "keyframes whose pose was found in the map and believed"),
@@ -76,15 +71,11 @@ def _page(run: Run, result: dict[str, Any], title: str, pictures: dict[str, tupl
         f'<h1>{escape(title)}</h1><p class="lead">{escape(_lead(run, result))}</p>',
         f'<p class="quiet">{escape(source)}</p>',
         _strip(run) + _table(run, seconds) if run.steps else "",
-        *(
-            f'<figure><img src="data:image/png;base64,{b64encode(png).decode()}" alt="{escape(name)}">'
-            f"<figcaption>{PICTURES[file][1]}</figcaption></figure>"
-            for file, (name, png) in pictures.items()
-        ),
+        *(picture(name, png, PICTURES[file][1]) for file, (name, png) in pictures.items()),
         f"<h2>Figures</h2>{_table(run, figures)}",
         f"<h2>Rejected, and why</h2>{_table(run, rejected)}" if rejected else "",
     ]
-    return PAGE.format(mark=MARK, title=escape(title), body="\n".join(filter(None, parts)))
+    return filled(title, parts)
 
 
 def _lead(run: Run, result: dict[str, Any]) -> str:
@@ -134,21 +125,6 @@ def _number(value: Any, digits: int = 4) -> str:
     return f"{value:.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
 
 
-# -- the folder ------------------------------------------------------------------------------------------------------
-
-
-def check_report_folder(folder: Path) -> None:
-    """A report goes where nothing is yet, or only an empty folder or a report. Raises FormatError elsewhere."""
-    page = folder / "index.html"
-    if not folder.resolve().parent.is_dir():
-        raise FormatError(f"there is no folder {folder.parent} to write the report {folder.name} to")
-    if folder.exists() and not folder.is_dir():
-        raise FormatError(f"{folder} is a file; name a folder for the report")
-    ours = page.is_file() and MARK in page.read_text(errors="replace")
-    if folder.exists() and any(folder.iterdir()) and not ours:
-        raise FormatError(f"{folder} is neither empty nor a report that could be replaced; name another folder")
-
-
 def write_report(
     folder: Path,
     result: dict[str, Any],
@@ -164,26 +140,7 @@ def write_report(
     step_s are the steps' durations in seconds, odometry their T_odom_cam, truth their T_map_cam, None where unknown.
     Raises FormatError where the folder holds anything else or cannot be written; nothing is left of a failed report.
     """
-    place = folder.resolve()
-    try:
-        check_report_folder(folder)
-        run = Run(steps, step_s, odometry, truth, map_)
-        pictures = draw_all(run)
-        files = {name: png for name, (_, png) in pictures.items()}
-        files["index.html"] = _page(run, result, title, pictures).encode("utf-8", "replace")
-        files["result.json"] = (json.dumps(result, indent=2, allow_nan=False) + "\n").encode()
-        with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as box:
-            new, old = Path(box, "new"), Path(box, "old")
-            new.mkdir()
-            for name, content in files.items():
-                (new / name).write_bytes(content)
-            if place.exists():
-                place.rename(old)
-            try:
-                new.rename(place)
-            except OSError:
-                if old.exists():
-                    old.rename(place)
-                raise
-    except OSError as e:
-        raise FormatError(f"the report {folder} cannot be written: {e.strerror}") from e
+    run = Run(steps, step_s, odometry, truth, map_)
+    pictures = draw_all(run)
+    page = _page(run, result, title, pictures)
+    write_folder(folder, page, result, {name: png for name, (_, png) in pictures.items()})

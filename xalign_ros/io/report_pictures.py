@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,17 +14,25 @@ from xalign_ros.core.evaluation import errors
 from xalign_ros.core.lie import Array
 from xalign_ros.core.records import INPUT_REASONS, Anchor, Rejection, State
 from xalign_ros.io.report_run import Run, direction, extent, plane, positions
+from xalign_ros.io.report_style import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PALE,
+    PURPLE,
+    RED,
+    SKY,
+    WIDTH_IN,
+    from_zero,
+    panels,
+    png,
+    styled,
+    with_legend,
+)
 
 MAP_POINTS = 20_000  # drawn at most
-WIDTH_IN, DPI = 6.4, 200
-
-# Okabe and Ito's colours, which the colour-blind tell apart; each has one meaning in all pictures.
-BLUE, SKY, GREEN, ORANGE, RED, PURPLE = "#0072B2 #56B4E9 #009E73 #E69F00 #D55E00 #CC79A7".split()
-INK, QUIET, GREY, PALE = "#222222 #5f5f5f #999999 #cccccc".split()
-STYLE = f"""axes.edgecolor={GREY} axes.grid=True axes.axisbelow=True axes.labelcolor={INK} axes.spines.right=False
-axes.spines.top=False axes.titlelocation=left axes.titlepad=10 axes.titlesize=11 axes.titleweight=bold font.size=9
-figure.constrained_layout.use=True figure.dpi={DPI} grid.color=#eeeeee legend.frameon=False lines.linewidth=1.4
-lines.markeredgewidth=0 text.color={INK} xtick.color={QUIET} ytick.color={QUIET}"""
 STATES = {
     State.UNINITIALIZED: (GREY, "no anchor was found yet"),
     State.CANDIDATE: (SKY, "anchors wait for others that agree with them; no pose is published"),
@@ -52,16 +58,9 @@ REASONS = {
 }
 
 
-def _figure(title: str, heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
-    figure = Figure((WIDTH_IN, sum(heights) + 0.8))
-    axes = list(figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0])
-    axes[0].set_title(title)
-    return figure, axes
-
-
 def _over_time(run: Run, title: str, heights: Sequence[float], labels: Sequence[str]) -> tuple[Figure, list[Axes]]:
     """Axes one below the other, shaded where the state is not LOCALIZED."""
-    figure, axes = _figure(title, heights)
+    figure, axes = panels(title, heights)
     axes[-1].set(xlabel="time since the first keyframe (s)", xlim=(-0.01 * run.end, 1.01 * run.end))
     for ax, label in zip(axes, labels, strict=True):
         ax.set_ylabel(label)
@@ -69,32 +68,6 @@ def _over_time(run: Run, title: str, heights: Sequence[float], labels: Sequence[
             if state != State.LOCALIZED:
                 ax.axvspan(start, to, color=STATES[state][0], alpha=0.22, lw=0, label=state.name)
     return figure, axes
-
-
-def _from_zero(ax: Axes, values: Array) -> None:
-    """The axis from zero, or in powers of ten where a few values would flatten all others."""
-    ax.set_ylim(0)
-    values = values[values > 0]
-    if len(values) and values.max() > 20 * np.median(values):
-        ax.set_yscale("log")
-        ax.set_ylim(np.percentile(values, 1) / 2)
-        ax.yaxis.set_major_formatter("{x:g}")
-        ax.yaxis.set_minor_formatter("")
-
-
-def _legend(figure: Figure, empty: str) -> Figure:
-    """The legend below, out of the data's way; axes without data say why."""
-    for ax in figure.axes:
-        if not ax.lines:
-            ax.set_yticks([])
-            ax.text(0.5, 0.5, empty, transform=ax.transAxes, ha="center", va="center", color=QUIET)
-    named = {label: h for ax in figure.axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    if named:
-        figure.set_figheight(figure.get_figheight() + 0.1 + 0.19 * np.ceil(len(named) / 3))
-        legend = figure.legend(named.values(), named, loc="outside lower left", ncols=3)
-        for line in legend.get_lines():
-            line.set_markersize(max(line.get_markersize(), 5))
-    return figure
 
 
 def _top_view(run: Run) -> Figure:
@@ -113,7 +86,7 @@ def _top_view(run: Run) -> Figure:
     drift = np.clip(np.vstack([lost, *raw]) @ axes.T, 1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low)
     low, high = extent(np.vstack([shown, drift]), keyframes)
     height = (WIDTH_IN - 0.6) * float((high - low)[1] / (high - low)[0])
-    figure, (ax,) = _figure(f"The run in the map{view}", [height])
+    figure, (ax,) = panels(f"The run in the map{view}", [height])
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal", anchor="N")
     ax.set(xlabel=f"{direction(axes[0])} ({run.unit})", ylabel=f"{direction(axes[1])} ({run.unit})")
@@ -138,7 +111,7 @@ def _top_view(run: Run) -> Figure:
     draw(positions(a.T_map_cam if a else None for a in refused), "x", "anchor, rejected", RED, ms=4.5, mew=1.1)
     first = run.published[np.isfinite(run.published).all(axis=1)][:1]
     draw(first, "o", "first pose", BLUE, mfc="white", ms=6.5, mew=1.4)
-    return _legend(figure, "")
+    return with_legend(figure, "")
 
 
 def _space_view(run: Run) -> Figure:
@@ -178,7 +151,7 @@ def _space_view(run: Run) -> Figure:
         getattr(ax, f"{name}axis").set_major_locator(MaxNLocator((5, 3, 3)[n]))
     ax.set_box_aspect(half / half.max(), zoom=1.2)
     ax.view_init(elev=28, azim=-62)
-    return _legend(figure, "")
+    return with_legend(figure, "")
 
 
 def _error(run: Run) -> Figure:
@@ -193,8 +166,8 @@ def _error(run: Run) -> Figure:
             ax.fill_between(run.time, sigma, color=BLUE, alpha=0.25, lw=0, label="predicted, 1 sigma")
             ax.fill_between(run.time, sigma, 2 * sigma, color=BLUE, alpha=0.12, lw=0, label="predicted, 2 sigma")
             ax.plot(run.time, line, ".-", color=INK, lw=1, ms=2.5, label="error")
-            _from_zero(ax, line)
-    return _legend(figure, "no pose to compare with the truth")
+            from_zero(ax, line)
+    return with_legend(figure, "no pose to compare with the truth")
 
 
 def _scale(run: Run) -> Figure:
@@ -207,14 +180,14 @@ def _scale(run: Run) -> Figure:
         ax.plot(run.time, scale, ".-", color=BLUE, ms=2.5, label="scale")
         for mine, S in run.fits if run.truth is not None else ():
             ax.plot(run.time[mine][[0, -1]], [S.s] * 2, "--", color=INK, lw=1, label="best fit in hindsight")
-    return _legend(figure, "never locked: the scale is not known")
+    return with_legend(figure, "never locked: the scale is not known")
 
 
 def _anchors(run: Run) -> Figure:
     reasons = [r for r in REASONS if any(s.rejection and s.rejection.reason == r for s in run.steps)]
     heights, labels = (1.7, 1.1, 0.2 + 0.2 * len(reasons)), ("count", "rms (px)", "")
-    panels = 3 if reasons else 2
-    figure, axes = _over_time(run, "Anchors: evidence for each pose", heights[:panels], labels[:panels])
+    count = 3 if reasons else 2
+    figure, axes = _over_time(run, "Anchors: evidence for each pose", heights[:count], labels[:count])
     timed = list(zip(run.time, run.steps, strict=True))
     evidence = [(t, a) for t, s in timed for a in (s.anchor, s.rejection) if a and a.matches]
     if evidence:
@@ -235,7 +208,7 @@ def _anchors(run: Run) -> Figure:
     for ax in axes[2:]:
         ax.set(yticks=range(len(reasons)), yticklabels=[r.replace("_", " ") for r in reasons])
         ax.set_ylim(len(reasons) - 0.4, -0.6)
-    return _legend(figure, "no pose was found")
+    return with_legend(figure, "no pose was found")
 
 
 def _step_time(run: Run) -> Figure:
@@ -247,8 +220,8 @@ def _step_time(run: Run) -> Figure:
             ax.plot(run.time[mine], run.ms[mine], ".", color=color, ms=3.5, label=name)
             ax.axhline(p50, color=color, lw=1, label=f"{name} p50 {p50:.3g} ms")
             ax.axhline(p99, color=color, lw=1, ls="--", label=f"{name} p99 {p99:.3g} ms")
-    _from_zero(ax, run.ms)
-    return _legend(figure, "no keyframe")
+    from_zero(ax, run.ms)
+    return with_legend(figure, "no keyframe")
 
 
 PICTURES = {  # file name: how it is drawn, what is seen in it
@@ -275,16 +248,9 @@ PICTURES = {  # file name: how it is drawn, what is seen in it
 def draw_all(run: Run) -> dict[str, tuple[str, bytes]]:
     """Title and PNG of each picture by file name; the same bytes for the same run."""
     pictures = {}
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        style: dict[Any, Any] = dict(item.split("=") for item in STYLE.split())
-        matplotlib.rcParams.update(style)
+    with styled():
         for name, (draw, _) in PICTURES.items():
             if name != "error.png" or run.truth is not None:
-                figure, buffer = draw(run), BytesIO()
-                figure.savefig(buffer, format="png", metadata={"Software": None})
-                pictures[name] = figure.axes[0].get_title("left"), buffer.getvalue()
+                figure = draw(run)
+                pictures[name] = figure.axes[0].get_title("left"), png(figure)
     return pictures
-
-
-# -- the page --------------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from xalign_ros.core.records import Step
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io.log import Log, LogFolder, LogWriter, RawMessage
+from xalign_ros.io.report_page import check_report_folder
 from xalign_ros.io.step_messages import TOPICS
 from xalign_ros.io.trajectory_files import write_trajectory
 from xalign_ros.io.tum import Trajectory, pose_at, read_tum
@@ -88,8 +89,6 @@ def check_report(report: Path | None, files: Sequence[Path | None]) -> None:
     """FormatError where the report could not be written at the end, or would replace one of the run's own files."""
     if report is None:
         return
-    from xalign_ros.io.report import check_report_folder  # its plotting library takes a second to import
-
     check_report_folder(report)
     for path in files:
         if path is not None and report.resolve() in (path.resolve(), *path.resolve().parents):
