@@ -41,6 +41,7 @@ def test_round_trip_is_exact(map_, folder) -> None:
         "sigma_px",
         "descriptor_gate",
         "anchor_sigma",
+        "keyframe_sigma",
     ):
         assert getattr(back, name) == getattr(map_, name), name
     for a, b in zip(back.cameras, map_.cameras, strict=True):

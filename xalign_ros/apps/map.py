@@ -77,6 +77,8 @@ def _info(args: argparse.Namespace) -> None:
         "sigma_px": map_.sigma_px,
         "anchor_sigma_m": map_.anchor_sigma[1],
         "anchor_sigma_rad": map_.anchor_sigma[0],
+        "keyframe_sigma_m": map_.keyframe_sigma[1],
+        "keyframe_sigma_rad": map_.keyframe_sigma[0],
         "extent": [round(float(x), 2) for x in high - low],
         "T_map_refmap": header["T_map_refmap"],
         "georeference": header.get("georeference"),

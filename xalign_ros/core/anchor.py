@@ -10,6 +10,7 @@ import numpy as np
 
 from xalign_ros.core.config import Config, Pnp
 from xalign_ros.core.lie import Array
+from xalign_ros.core.map_error import pose_influence, shared_covariance, telling
 from xalign_ros.core.matching import NO_MATCHES, Matches, guided_matches, place_matches, places
 from xalign_ros.core.pnp import Points2D3D, Pose, estimate_pose, evidence, refine_pose, sample_pose, upper_median
 from xalign_ros.core.records import Anchor, Keyframe, Rejection
@@ -85,6 +86,29 @@ class _Search:
         map_, f, p = self.index.map, matches.feature, matches.point
         return Points2D3D(self.features.uv[f], self.sigma_px[f], map_.points[p], map_.point_cov[p].astype(float))
 
+    def result(self, matches: Matches, found: Pose | str, runner_up: float, config: Pnp) -> Anchor | Rejection:
+        who = (self.keyframe.id, self.keyframe.session, self.keyframe.stamp_ns)
+        if isinstance(found, str):
+            detail = DETAILS[found].format(matches=len(matches), needed=config.min_inliers, runner_up=runner_up)
+            return Rejection(*who, found, detail, len(matches))
+        cov = found.cov_cam + self._map_covariance(matches, found)
+        anchor = Anchor(*who, found.T_map_cam, cov, len(matches), _inliers(found), found.rms_px, runner_up)
+        if runner_up > config.max_runner_up:
+            detail = DETAILS["ambiguous"].format(runner_up=runner_up)
+            return Rejection(*who, "ambiguous", detail, len(matches), anchor.inliers, anchor.rms_px, runner_up, anchor)
+        return anchor
+
+    def _map_covariance(self, matches: Matches, found: Pose) -> Array:
+        """What the map's keyframes err: that of the points' own ones, and what any pose is off from where it was given."""
+        variance = np.square(self.index.map.keyframe_sigma)
+        if not variance.any():
+            return CERTAIN
+        some = _kept(matches, telling(found.inlier))
+        m, sources = self.pairs(some), self.index.sources(some.point)
+        influence = pose_influence(found.T_map_cam, m, self.camera)
+        rotation, position = shared_covariance(influence, m.xyz, m.cov, sources)
+        return np.asarray(np.diag(np.repeat(variance, 3)) + variance[0] * rotation + variance[1] * position)
+
 
 def find_guided(
     keyframe: Keyframe, index: MapIndex, T_map_cam: SE3, cov_cam: Array, config: Config
@@ -101,7 +125,7 @@ def find_guided(
         if isinstance(coarse, SE3):
             T_map_cam, cov_cam = coarse, CERTAIN
         matches, _ = search.around(points, T_map_cam, cov_cam)
-    return _result(keyframe, index, matches, search.pose(matches, config.pnp, T_map_cam), 0.0, config.pnp)
+    return search.result(matches, search.pose(matches, config.pnp, T_map_cam), 0.0, config.pnp)
 
 
 def find_anywhere(keyframe: Keyframe, index: MapIndex, config: Config) -> Anchor | Rejection:
@@ -129,14 +153,14 @@ def sight(keyframe: Keyframe, index: MapIndex, config: Config) -> tuple[Anchor |
     sighting, poses = Sighting(keyframe, tuple(seen)), [(m, p) for m, p in tried if isinstance(p, Pose)]
     if not poses:
         most = max(tried, key=lambda t: len(t[0]), default=(NO_MATCHES, "too_few_matches"))
-        return _result(keyframe, index, *most, 0.0, search.few), sighting
+        return search.result(*most, 0.0, search.few), sighting
     distance = np.full((len(poses), len(keyframe.features)), np.inf)
     for row, (matches, pose) in zip(distance, poses, strict=True):
         row[matches.feature[pose.inlier]] = matches.distance[pose.inlier]
     support = (np.isfinite(distance) & (config.matching.cold_ratio * distance <= distance.min(axis=0))).sum(axis=1)
     first = int(support.argmax())
     others = [int(n) for n, hypothesis in zip(support, poses, strict=True) if _elsewhere(hypothesis, poses[first])]
-    result = _result(keyframe, index, *poses[first], max(others, default=0) / int(support[first]), search.few)
+    result = search.result(*poses[first], max(others, default=0) / int(support[first]), search.few)
     return result, sighting
 
 
@@ -165,7 +189,7 @@ def find_together(sightings: Sequence[Sighting], index: MapIndex, config: Config
         near = index.keyframes_near(T, config.matching.guided_keyframes)
         around, _ = search.around(index.visible_points(T, near), T, cov)
         pose = search.pose(around, search.few, T)
-        found = _result(search.keyframe, index, around, pose, 0.0, search.few)
+        found = search.result(around, pose, 0.0, search.few)
         sure = isinstance(found, Anchor) and found.inliers >= config.pnp.min_inliers
         if isinstance(found, Anchor) and sure and not _far((T, cov), (found.T_map_cam, found.cov_cam)):
             anchors[found.keyframe_id] = found
@@ -210,19 +234,3 @@ def _elsewhere(a: tuple[Matches, Pose], b: tuple[Matches, Pose]) -> bool:
     points = [m.point[p.inlier] for m, p in (a, b)]
     shared = len(np.intersect1d(*points)) / min(len(x) for x in points)
     return shared < 0.5 and _far(*((p.T_map_cam, p.cov_cam) for _, p in (a, b)))
-
-
-def _result(
-    keyframe: Keyframe, index: MapIndex, matches: Matches, found: Pose | str, runner_up: float, config: Pnp
-) -> Anchor | Rejection:
-    who = (keyframe.id, keyframe.session, keyframe.stamp_ns)
-    if isinstance(found, str):
-        detail = DETAILS[found].format(matches=len(matches), needed=config.min_inliers, runner_up=runner_up)
-        return Rejection(*who, found, detail, len(matches))
-    floor = np.repeat(np.square(index.map.anchor_sigma), 3)
-    cov = found.cov_cam + np.diag(floor)
-    anchor = Anchor(*who, found.T_map_cam, cov, len(matches), _inliers(found), found.rms_px, runner_up)
-    if runner_up > config.max_runner_up:
-        detail = DETAILS["ambiguous"].format(runner_up=runner_up)
-        return Rejection(*who, "ambiguous", detail, len(matches), anchor.inliers, anchor.rms_px, runner_up, anchor)
-    return anchor

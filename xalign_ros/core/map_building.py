@@ -10,6 +10,7 @@ from xalign_ros.core.camera import Camera
 from xalign_ros.core.config import Pnp
 from xalign_ros.core.descriptors import nearest_to_mean, pair_distance
 from xalign_ros.core.lie import Array
+from xalign_ros.core.map_error import Sources, held_out_sigmas, pose_influence, shared_covariance, telling
 from xalign_ros.core.map_refinement import Bearings, refine_poses
 from xalign_ros.core.pnp import Points2D3D, Pose, refine_pose
 from xalign_ros.core.progress import Progress, unseen
@@ -141,6 +142,7 @@ def map_of_points(
     seen = np.flatnonzero(feature_point >= 0)
     medoid = nearest_to_mean(obs.descriptors[seen], feature_point[seen], len(points), norm)
     descriptors = obs.descriptors[seen[medoid]]
+    anchor_sigma, keyframe_sigma = _anchor_sigma(obs, feature_point, given, cameras, keyframe_camera, sigma_px)
     return ReferenceMap(
         map_id=map_id,
         version="",
@@ -162,7 +164,8 @@ def map_of_points(
         feature_point=feature_point,
         sigma_px=sigma_px,
         descriptor_gate=_descriptor_gate(obs.descriptors[seen], descriptors[feature_point[seen]], norm),
-        anchor_sigma=_anchor_sigma(obs, feature_point, given, cameras, keyframe_camera, sigma_px),
+        anchor_sigma=anchor_sigma,
+        keyframe_sigma=keyframe_sigma,
         S_map_refmap=S_map_refmap or Sim3.identity(),
     )
 
@@ -201,38 +204,39 @@ def _anchor_sigma(
     cameras: tuple[Camera, ...],
     keyframe_camera: np.ndarray,
     sigma_px: float,
-) -> tuple[float, float]:
-    """What anchors in this map err beyond their own covariance: (rad, m).
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What anchors in this map err beyond the covariance of their matches, and what of it a keyframe's own pose: (rad, m).
 
     Every fifth keyframe is held out in turn, the rest is triangulated anew, and the held-out keyframe's pose from its
-    own tracks is compared with the pose it was given. Per axis, robust: 1.4826 medians, whose squares have a relative
-    standard error of 2.33 / sqrt(n) (Rousseeuw and Croux 1993). Where nothing is in excess, half of the chance outcomes are
-    cut off at zero and the mean of the others is 0.4 of that: so much is taken off.
+    own tracks is compared with the pose it was given.
     """
     count = int(track.max()) + 1
-    error, own = [], []
+    found = []
     for fold in range(FOLDS):
         held = obs.frame % FOLDS == fold
         rows = np.flatnonzero((track >= 0) & ~held)
         rest = triangulate(track[rows], count, obs.centre[rows], obs.ray[rows], sigma_px / obs.focal[rows])
+        good = rows[rest.inlier]
         for k in range(fold, len(given), FOLDS):
             features = slice(obs.offset[k], obs.offset[k + 1])
             seen = np.flatnonzero(track[features] >= 0)
             seen = seen[rest.kept[track[features][seen]]]
             point = track[features][seen]
             pairs = Points2D3D(obs.uv[features][seen], np.full(len(seen), sigma_px), rest.xyz[point], rest.cov[point])
-            pose = refine_pose(obs.poses[k], pairs, cameras[keyframe_camera[k]], Pnp()) if len(seen) >= 12 else ""
+            camera = cameras[keyframe_camera[k]]
+            pose = refine_pose(obs.poses[k], pairs, camera, Pnp()) if len(seen) >= 12 else ""
             if isinstance(pose, Pose):
-                error.append((given[k].inverse() @ pose.T_map_cam).log())
-                own.append(np.diag(pose.cov_cam))
-    if len(error) < FOLDS:
-        return 0.0, 0.0
-    spread = (1.4826 * np.median(np.abs(error), axis=0)) ** 2
-    excess = spread - np.median(own, axis=0)
-    chance = 0.4 * 2.33 / np.sqrt(3 * len(error))
-    parts = [excess[axes].mean() - chance * spread[axes].mean() for axes in (slice(0, 3), slice(3, 6))]
-    rotation, translation = np.sqrt(np.maximum(parts, 0))
-    return float(rotation), float(translation)
+                error = (given[k].inverse() @ pose.T_map_cam).log()
+                some = telling(pose.inlier)
+                m, at = pairs.take(some), np.full(count, -1)
+                at[point[some]] = np.arange(len(some))
+                from_ = good[at[track[good]] >= 0]
+                sources = Sources(at[track[from_]], obs.frame[from_], obs.centre[from_], sigma_px / obs.focal[from_])
+                parts = shared_covariance(pose_influence(pose.T_map_cam, m, camera), m.xyz, m.cov, sources)
+                found.append((error, pose.cov_cam, *parts))
+    if len(found) < FOLDS:
+        return (0.0, 0.0), (0.0, 0.0)
+    return held_out_sigmas(*(np.array(column) for column in zip(*found, strict=True)))
 
 
 def _descriptor_gate(observed: np.ndarray, of_point: np.ndarray, norm: Norm) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.lie import Array
+from xalign_ros.core.map_error import Sources
 from xalign_ros.core.records import Norm
 from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.core.vocabulary import Vocabulary
@@ -74,7 +75,8 @@ class ReferenceMap:
     points (M, 3) m in the map frame with covariance (M, 3, 3); descriptors (M, B), one per point. keyframe_R, keyframe_t:
     T_map_cam; features of keyframe k are rows feature_offset[k]:feature_offset[k+1] of feature_uv (F, 2) px,
     feature_descriptors (F, B) and feature_point (F,), -1 = none. sigma_px is the robust reprojection residual of the
-    map's own observations; anchor_sigma = (rad, m) what a held-out keyframe's anchor errs beyond its covariance;
+    map's own observations; anchor_sigma = (rad, m) what a held-out keyframe's anchor errs beyond the covariance of its
+    matches, keyframe_sigma what of it one keyframe's own pose errs, and with it all that was triangulated from there;
     descriptor_gate the distance below which two descriptors may be of one point. S_map_refmap leads from the frame that
     the map's source had; georeference is latitude, longitude (deg) and height (m, WGS84) of the map's origin, whose axes
     are then east, north, up. visibility and vocabulary are of these
@@ -102,6 +104,7 @@ class ReferenceMap:
     sigma_px: float
     descriptor_gate: float
     anchor_sigma: tuple[float, float] = (0.0, 0.0)
+    keyframe_sigma: tuple[float, float] = (0.0, 0.0)
     S_map_refmap: Sim3 = field(default_factory=Sim3.identity)
     georeference: tuple[float, float, float] | None = None
     visibility: Visibility | None = None
@@ -152,6 +155,7 @@ class MapIndex:
         self.map = map_ = _plain(map_)
         self.visibility = _plain(map_.visibility or Visibility.of(map_))
         self._axis = np.ascontiguousarray(map_.keyframe_R[:, :, 2])
+        self._ray_rad = map_.sigma_px / np.array([c.K[:2].mean() for c in map_.cameras])
         self.vocabulary = _plain(map_.vocabulary or Vocabulary.learn(map_.descriptors, map_.norm))
 
     def points_of(self, keyframes: np.ndarray) -> np.ndarray:
@@ -187,13 +191,23 @@ class MapIndex:
 
     def votes(self, points: np.ndarray, weight: Array | None = None) -> Array:
         """Votes (K,) of matched points, of weight (N,) or 1 each, for the keyframes that see them, each shared between them."""
+        keyframe, counts = self._observers(points)
+        each = (1.0 if weight is None else weight) / np.sqrt(np.maximum(counts, 1))
+        return np.asarray(np.bincount(keyframe, np.repeat(each, counts), minlength=len(self.map.keyframe_t)), float)
+
+    def sources(self, points: np.ndarray) -> Sources:
+        """What these points were triangulated from."""
+        keyframe, counts = self._observers(points)
+        ray_rad = self._ray_rad[self.map.keyframe_camera[keyframe]]
+        return Sources(np.repeat(np.arange(len(points)), counts), keyframe, self.map.keyframe_t[keyframe], ray_rad)
+
+    def _observers(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The keyframes that see the first of the points, then the second, and so on; and how many see each."""
         v = self.visibility
         first = v.point_offset[points]
         counts = v.point_offset[points + 1] - first
         rows = np.repeat(first - np.r_[0, np.cumsum(counts)[:-1]], counts) + np.arange(counts.sum())
-        each = (1.0 if weight is None else weight) / np.sqrt(np.maximum(counts, 1))
-        votes = np.bincount(v.point_keyframe[rows], np.repeat(each, counts), minlength=len(self.map.keyframe_t))
-        return np.asarray(votes, float)
+        return v.point_keyframe[rows], counts
 
     def covisible(self, keyframe: int, count: int) -> np.ndarray:
         """The map keyframes that share most points with this one, itself first."""

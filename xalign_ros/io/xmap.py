@@ -19,7 +19,7 @@ from xalign_ros.core.reference_map import MapIndex, ReferenceMap, Visibility
 from xalign_ros.core.transforms import Sim3
 from xalign_ros.core.vocabulary import Vocabulary
 
-FORMAT = 2
+FORMAT = 3
 ARRAYS = {
     "points": "<f8",
     "point_cov": "<f4",
@@ -49,6 +49,7 @@ VOCABULARY: dict[str, str | None] = {
     "code": None,
 }  # of code: by its width
 
+SIGMAS = ("rotation_rad", "translation_m")
 GEOREFERENCE = ("latitude_deg", "longitude_deg", "height_m")
 
 
@@ -98,7 +99,7 @@ def _header(map_: ReferenceMap, version: str, arrays: dict[str, Any]) -> dict[st
         "features": len(map_.feature_uv),
         "descriptor": {"name": map_.descriptor_name, "norm": map_.norm.name, "gate": float(map_.descriptor_gate)},
         "sigma_px": float(map_.sigma_px),
-        "anchor_sigma": {"rotation_rad": float(map_.anchor_sigma[0]), "translation_m": float(map_.anchor_sigma[1])},
+        **{n: dict(zip(SIGMAS, map(float, getattr(map_, n)), strict=True)) for n in ("anchor_sigma", "keyframe_sigma")},
         "T_map_refmap": {"rotation": S.R.tolist(), "translation": S.t.tolist(), "scale": S.s},
         "georeference": dict(zip(GEOREFERENCE, map_.georeference, strict=True)) if map_.georeference else None,
         "cameras": [
@@ -121,7 +122,7 @@ def read_map(folder: Path, *, verify: bool = False) -> ReferenceMap:
         for names in (ARRAYS, VISIBILITY, VOCABULARY)
     )
     try:
-        S, d, a = header["T_map_refmap"], header["descriptor"], header["anchor_sigma"]
+        S, d = header["T_map_refmap"], header["descriptor"]
         return ReferenceMap(
             map_id=str(header["id"]),
             version=str(header["version"]),
@@ -133,7 +134,8 @@ def read_map(folder: Path, *, verify: bool = False) -> ReferenceMap:
             descriptor_gate=float(d["gate"]),
             cameras=tuple(Camera(c["model"], c["K"], c["D"], c["width"], c["height"]) for c in header["cameras"]),
             sigma_px=float(header["sigma_px"]),
-            anchor_sigma=(float(a["rotation_rad"]), float(a["translation_m"])),
+            anchor_sigma=_sigmas(header["anchor_sigma"]),
+            keyframe_sigma=_sigmas(header["keyframe_sigma"]),
             S_map_refmap=Sim3(np.array(S["rotation"]), np.array(S["translation"]), S["scale"]),
             georeference=_origin(header.get("georeference")),
             **arrays,
@@ -164,6 +166,11 @@ def read_header(folder: Path) -> dict[str, Any]:
         have = header.get("format") if isinstance(header, dict) else None
         raise MapError(f"{path} has format {have}, this version reads format {FORMAT}; build the map anew")
     return header
+
+
+def _sigmas(entry: dict[str, Any]) -> tuple[float, float]:
+    rotation, translation = (float(entry[name]) for name in SIGMAS)
+    return rotation, translation
 
 
 def _read_array(folder: Path, name: str, header: dict[str, Any], verify: bool) -> np.ndarray:
