@@ -211,6 +211,21 @@ def test_beyond_the_descriptor_gate_is_no_match(world, index):
     assert len(m) < 30 and len(guided(world, index, T, far)) < 30
 
 
+def test_a_keypoint_with_two_descriptors_is_measured_once(world, index):
+    """SIFT gives a keypoint each of its orientations; both may find a point of the map."""
+    T = world.truth[12]
+    features, _ = seen(world, T)
+    twice = np.repeat(np.arange(len(features)), 2)
+    codes = features.descriptors[twice].copy()
+    codes[1::2, 0] ^= 1
+    doubled = Features(features.uv[twice], codes, features.name)
+    for m in (guided(world, index, T, doubled), place_matches(doubled, index, index.keyframes_near(T, 10), CONFIG)):
+        assert len(m) > 100 and len(np.unique(doubled.uv[m.feature], axis=0)) == len(m)
+    shifted = Features(doubled.uv, np.roll(codes, 1, axis=0), features.name)  # the two at one place are of two points
+    m = guided(world, index, T, shifted, np.diag([0.05] * 3 + [0.05] * 3) ** 2)
+    assert len(np.unique(shifted.uv[m.feature], axis=0)) == len(m) > 20
+
+
 # Places -------------------------------------------------------------------------------------------------------------
 
 

@@ -66,7 +66,7 @@ def guided_matches(
     points = points[seen]
     distance = indexed_distance(features.descriptors, map_.descriptors[points], feature, at, map_.norm)
     matches = _one_to_one(
-        feature, points[at], distance, config.guided_ratio, map_.points, T_map_cam.t, map_.descriptor_gate
+        features.uv, feature, points[at], distance, config.guided_ratio, map_.points, T_map_cam.t, map_.descriptor_gate
     )
     return matches, step == 1
 
@@ -133,7 +133,7 @@ def place_matches(features: Features, index: MapIndex, keyframes: np.ndarray, co
     feature = np.repeat(np.arange(len(features)), found.shape[1])
     point, distance = points[found.ravel()], distance.ravel()
     eye = map_.keyframe_t[keyframes[0]]
-    return _one_to_one(feature, point, distance, config.cold_ratio, map_.points, eye, map_.descriptor_gate)
+    return _one_to_one(features.uv, feature, point, distance, config.cold_ratio, map_.points, eye, map_.descriptor_gate)
 
 
 def places(features: Features, index: MapIndex, config: Matching) -> list[np.ndarray]:
@@ -164,9 +164,19 @@ def places(features: Features, index: MapIndex, config: Matching) -> list[np.nda
 
 
 def _one_to_one(
-    feature: np.ndarray, point: np.ndarray, distance: Array, ratio: float, xyz: Array, eye: Array, gate: float
+    uv: Array,
+    feature: np.ndarray,
+    point: np.ndarray,
+    distance: Array,
+    ratio: float,
+    xyz: Array,
+    eye: Array,
+    gate: float,
 ) -> Matches:
-    """Mutual best pairs whose distance is below `ratio` times that of the feature's best pair with a different point."""
+    """Mutual best pairs whose distance is below `ratio` times that of the feature's best pair with a different point.
+
+    Of features at one place uv (N, 2), as SIFT has where a keypoint has two orientations, the nearest: it is measured once.
+    """
     some = np.flatnonzero(distance * ratio <= gate)  # a runner-up beyond this cannot fail a pair within the gate
     if not len(some):
         return NO_MATCHES
@@ -183,7 +193,10 @@ def _one_to_one(
     # One to one from the other side: of the features that chose a point, the nearest keeps it.
     order = np.lexsort((f[keep], d[keep], p[keep]))
     keep = keep[order]
-    keep = np.sort(keep[_starts(p[keep])])
+    keep = keep[_starts(p[keep])]
+    keep = keep[np.argsort(d[keep], kind="stable")]
+    _, once = np.unique(uv[f[keep]] @ [1, 1j], return_index=True)
+    keep = np.sort(keep[once])
     return Matches(f[keep], p[keep], d[keep])
 
 
