@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import worlds
-from log_samples import write_mcap, write_rosbag1, write_rosbag2
+from log_samples import cdr, ros1_store, write_mcap, write_rosbag1, write_rosbag2
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from xalign_ros.apps.main import main
 from xalign_ros.core.records import Features, Keyframe
@@ -44,6 +47,39 @@ def replay(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]
 def numbers(result: dict[str, Any]) -> dict[str, Any]:
     """All that does not depend on how fast the machine is."""
     return {k: v for k, v in result.items() if k not in ("step_ms", "realtime_factor")}
+
+
+@pytest.mark.parametrize("kind", ["mcap", "rosbag2_sqlite3", "rosbag1"])
+def test_messages_of_one_log_time_may_change_places(kind, world, tmp_path, capsys) -> None:
+    """Recorded three at a time, as by a bridge that sends in bursts, in the order of the run and in three others."""
+    work, run = world
+    ids = list(range(0, len(run), 2))
+    hashes = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        bursts = [ids[n : n + 3] for n in range(0, len(ids), 3)]
+        order = [k for burst in bursts for k in (rng.permutation(burst) if seed else burst)]
+        late = [1 + 10 * (ids.index(k) // 3) for k in order]
+        path = tmp_path / f"{seed}.{'bag' if kind == 'rosbag1' else 'mcap' if kind == 'mcap' else 'folder'}"
+        write_arrivals(
+            kind, path, [(run.keyframes[0].stamp_ns + t, run.keyframes[k]) for k, t in zip(order, late, strict=True)]
+        )
+        hashes.append(replay(capsys, path, "--map", work / "m.xmap")["hash"])
+    assert len(set(hashes)) == 1
+
+
+def write_arrivals(kind: str, path: Path, arrivals: list[tuple[int, Keyframe]]) -> None:
+    if kind == "mcap":
+        with LogWriter(path) as log:
+            for at_ns, k in arrivals:
+                log.write("keyframes", KEYFRAME, keyframe_message(typestore().types.__getitem__, k), at_ns)
+        return
+    old, new = kind == "rosbag1", {"version": 9, "storage_plugin": StoragePlugin.SQLITE3}
+    with Rosbag1Writer(path) if old else Rosbag2Writer(path, **new) as writer:
+        connection = writer.add_connection("/keyframes", KEYFRAME, typestore=ros1_store() if old else typestore())
+        for at_ns, k in arrivals:
+            data = typestore().cdr_to_ros1(cdr(k), KEYFRAME) if old else cdr(k)
+            writer.write(connection, at_ns, bytes(data))
 
 
 def test_outputs_agree_with_each_other(world, tmp_path, capsys) -> None:

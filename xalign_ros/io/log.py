@@ -128,16 +128,24 @@ class Log:
         return names[0]
 
     def keyframes(self, topic: str | None = None) -> Iterator[tuple[int, Keyframe | None, Rejection | None]]:
-        """(log time in ns, then what `keyframe_of` says), by log time; equal times in the order of the file.
+        """(log time in ns, then what `keyframe_of` says), by log time; of one log time by session, stamp, id and bytes.
 
+        So whatever order a recorder gave messages of one time, the keyframes are the same.
         Raises LogError where bytes are damaged or fewer messages come than the log announces.
         """
+        held: list[tuple[KeyframeFields, bytes]] = []
+        held_ns = 0
         for connection, time_ns, data in self._read({(self.keyframe_topic(topic), KEYFRAME)}):
             try:
                 fields = self._keyframe_fields(connection, data)
             except Exception as error:
                 raise self._named(error, connection, time_ns) from error
-            yield time_ns, *keyframe_of(fields)
+            if held and time_ns != held_ns:
+                yield from _in_order(held_ns, held)
+                held = []
+            held.append((fields, data))
+            held_ns = time_ns
+        yield from _in_order(held_ns, held)
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
         """The messages of `topics` (exact names; None = all) by log time; those of ROS 1 are converted to CDR."""
@@ -220,6 +228,15 @@ class Log:
         told = [f"{t.name} ({t.type}, {t.messages})" for t in self.topics()]
         more = f" and {len(told) - LISTED} more" if len(told) > LISTED else ""
         return ", ".join(told[:LISTED]) + more if told else "no topics at all"
+
+
+def _in_order(
+    time_ns: int, held: list[tuple[KeyframeFields, bytes]]
+) -> Iterator[tuple[int, Keyframe | None, Rejection | None]]:
+    if len(held) > 1:
+        held.sort(key=lambda one: (one[0].session, one[0].stamp_ns, one[0].id, bytes(one[1])))
+    for fields, _ in held:
+        yield time_ns, *keyframe_of(fields)
 
 
 def _qos(connection: Connection) -> str:
