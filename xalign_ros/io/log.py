@@ -135,16 +135,20 @@ class Log:
         """
         held: list[tuple[KeyframeFields, bytes]] = []
         held_ns = 0
-        for connection, time_ns, data in self._read({(self.keyframe_topic(topic), KEYFRAME)}):
-            try:
-                fields = self._keyframe_fields(connection, data)
-            except Exception as error:
-                raise self._named(error, connection, time_ns) from error
-            if held and time_ns != held_ns:
-                yield from _in_order(held_ns, held)
-                held = []
-            held.append((fields, data))
-            held_ns = time_ns
+        try:
+            for connection, time_ns, data in self._read({(self.keyframe_topic(topic), KEYFRAME)}):
+                try:
+                    fields = self._keyframe_fields(connection, data)
+                except Exception as error:
+                    raise self._named(error, connection, time_ns) from error
+                if held and time_ns != held_ns:
+                    yield from _in_order(held_ns, held)
+                    held = []
+                held.append((fields, data))
+                held_ns = time_ns
+        except LogError:
+            yield from _in_order(held_ns, held)  # what came before it is sound
+            raise
         yield from _in_order(held_ns, held)
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
