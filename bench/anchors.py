@@ -1,7 +1,7 @@
 """Anchors: found in a million points, in time; the pose from matches, and whether its covariance is true; exit 1 on a miss.
 
 bench/anchors.py [--only NAME] [--json]. Names: pnp_time, million_orb, million_sift, million_freak, single_frames,
-first_lock, pnp_nees (a quarter of an hour; the others as much together). Needs `pip install faiss-cpu`.
+first_lock, window_peers, pnp_nees (a quarter of an hour; the others as much together). Needs `pip install faiss-cpu`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import pycolmap
 import real_data
 from case import Case, run
 from million import million, right
+from window_peers import window_peers
 
 from xalign_ros.core import aligner
 from xalign_ros.core.anchor import find_anywhere
@@ -175,7 +176,7 @@ def first_lock(case: Case) -> None:
         case.figure(f"{label}largest error at the lock, m", max(errors), high=np.inf if label else 0.5)
 
 
-CASES = (pnp_time, million_orb, million_sift, million_freak, single_frames, first_lock, pnp_nees)
+CASES = (pnp_time, million_orb, million_sift, million_freak, single_frames, first_lock, window_peers, pnp_nees)
 
 if __name__ == "__main__":
     sys.exit(run(__doc__, {case.__name__: case for case in CASES}))
