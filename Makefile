@@ -63,7 +63,7 @@ check: $(STAMP)
 
 bench: $(STAMP)
 	$(PY) -m pip install -q pytheia==1.2.1 faiss-cpu
-	@missed=0; for name in main_job batch live logs faults anchors posegraph graph bundle surfaces; do $(PY) bench/$$name.py || missed=1; done; exit $$missed
+	@missed=0; for name in main_job batch live logs faults anchors posegraph graph bundle align surfaces; do $(PY) bench/$$name.py || missed=1; done; exit $$missed
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info demo_report .mypy_cache .pytest_cache .ruff_cache .hypothesis
