@@ -40,8 +40,9 @@ def world(seed=0, views=7, tracks=20):
     )
 
 
-def test_one_similarity_moves_everything_by_it() -> None:
+def test_one_similarity_moves_everything_by_it_and_turns_what_is_at_infinity() -> None:
     r, rng = world(), np.random.default_rng(1)
+    r = replace(r, at_infinity=np.arange(20) % 4 == 1)
     G = similarities(rng, 1)
     keyframes = np.array([0, 2, 3, 6])
     old = r.R[keyframes], r.t[keyframes], np.full(4, 2.0)
@@ -50,6 +51,7 @@ def test_one_similarity_moves_everything_by_it() -> None:
     np.testing.assert_allclose(out.t, acting(tuple(np.repeat(x, 7, axis=0) for x in G), r.t), atol=1e-9)
     np.testing.assert_allclose(out.R, G[0] @ r.R, atol=1e-9)
     expected = acting(tuple(np.repeat(x, 20, axis=0) for x in G), r.points)
+    expected = np.where(r.at_infinity[:, None], r.points @ G[0][0].T, expected)
     np.testing.assert_allclose(out.points[:-1], expected[:-1], atol=1e-9)
     np.testing.assert_array_equal(out.points[-1], r.points[-1])
 

@@ -71,9 +71,9 @@ def run(args: argparse.Namespace) -> None:
     segment = read_described(args.segment, args.segment_database, _tell)
     index, keyframes, order = _index(args.segment, segment), source.keyframes(), source.order()
     _check_same_descriptors(source, segment)
-    in_order = replace(  # every estimated view is a node, none is interpolated
-        source.reconstruction, stamps_ns=None, at_infinity=None
-    )
+    in_order = replace(source.reconstruction, stamps_ns=None)  # every estimated view is a node, none is interpolated
+    if args.inverse_depth and in_order.at_infinity is not None:
+        in_order = replace(in_order, track_estimated=in_order.track_estimated | in_order.at_infinity)
     try:
         if args.similarity:
             seen = source.points_seen(), source.posed.points, index, config
@@ -135,7 +135,7 @@ def _told(aligned: AlignedRun, views: int) -> dict[str, Any]:
 def _told_bundle(done: Bundled, segment_points: int) -> dict[str, Any]:
     infinite = done.reconstruction.at_infinity
     return {
-        "tracks_at_infinity": 0 if infinite is None else int(infinite.sum()),
+        "tracks_at_infinity": 0 if infinite is None else int(infinite[done.reconstruction.track_estimated].sum()),
         "observations": done.observations,
         "segment_points": segment_points,
         "initial_cost": done.initial_cost,

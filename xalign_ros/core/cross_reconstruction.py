@@ -61,7 +61,9 @@ def align_to_map(
         anchors=anchors if len(anchors) else None,
     )
     solution = solve(graph, marginals=marginals)
-    in_map = replace(run, R=S.R @ run.R, t=S.apply(run.t), points=S.apply(run.points), priors=None)
+    far = np.zeros((len(run.points), 1), bool) if run.at_infinity is None else run.at_infinity[:, None]
+    points = np.where(far, run.points @ S.R.T, S.apply(run.points))
+    in_map = replace(run, R=S.R @ run.R, t=S.apply(run.t), points=points, priors=None)
     return apply(in_map, keyframes, (solution.R, solution.t, solution.s), start), solution
 
 

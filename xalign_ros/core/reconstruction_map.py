@@ -118,6 +118,8 @@ def described_tracks(r: Reconstruction, descriptor_name: str) -> PosedReconstruc
     if r.camera is None or r.descriptors is None:
         raise ValueError("none of its tracks has a descriptor; set them before writing, or give the images")
     told = r.track_estimated & np.isfinite(r.descriptors).all(axis=1)
+    if r.at_infinity is not None:
+        told &= ~r.at_infinity
     track = np.repeat(np.arange(len(r.points)), np.diff(r.offsets))
     rows = [np.flatnonzero((r.observing_views == v) & told[track]) for v in views]
     new = np.cumsum(told) - 1

@@ -65,7 +65,7 @@ def bundled(
         t=r.t,
         points=r.points[:own],
         track_estimated=r.track_estimated[:own],
-        at_infinity=None if r.at_infinity is None else r.at_infinity[:own],
+        at_infinity=r.at_infinity[:own] if r.at_infinity is not None else None,
     )
     return replace(done, reconstruction=back), count
 
@@ -104,6 +104,8 @@ def retriangulated(r: Reconstruction) -> Reconstruction:
     turned = np.einsum("oij,oj->oi", r.R[view], ray[used])
     found = triangulate(track[used], len(r.points), r.t[view], turned, (sigma_px / focal)[used])
     kept = found.kept & r.track_estimated
+    if r.at_infinity is not None:
+        kept &= ~r.at_infinity
     return replace(r, points=np.where(kept[:, None], found.xyz, r.points))
 
 
@@ -134,7 +136,7 @@ def with_segment(
         sigma_px=np.vstack([own, np.repeat(sigma[order, None], 2, axis=1)]),
         colours=None,
         descriptors=None,
-        at_infinity=None,
+        at_infinity=None if r.at_infinity is None else np.r_[r.at_infinity, np.zeros(n, bool)],
     ), n
 
 

@@ -100,9 +100,15 @@ def apply(
         whole[keyframes] = part
     moved[keyframes] = True
     points = warp_points(r.points, r.offsets, r.observing_views, of_views, moved)
+    known = r.track_estimated
+    if r.at_infinity is not None:  # directions only turn
+        known = known | r.at_infinity
+        turns = of_views[0], np.zeros((n, 3)), np.ones(n)
+        turned = warp_points(r.points, r.offsets, r.observing_views, turns, moved)
+        points = np.where(r.at_infinity[:, None], turned, points)
     return replace(
         r,
         R=np.where(moved[:, None, None], of_views[0] @ r.R, r.R),
         t=np.where(moved[:, None], of_views[2][:, None] * np.einsum("nij,nj->ni", of_views[0], r.t) + of_views[1], r.t),
-        points=np.where(r.track_estimated[:, None], points, r.points),
+        points=np.where(known[:, None], points, r.points),
     )
