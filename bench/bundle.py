@@ -1,6 +1,7 @@
 """Bundle adjustment beside pyTheia and pycolmap; exit 1 on a miss. bench/bundle.py [--only NAME] [--json]
 
-Names: golden, n60, n240 (cases of pyTheia's table), wall (400 views, 40,000 tracks).
+Names: golden, n60, n240 (cases of pyTheia's table), wall (400 views, 40,000 tracks), chain (500, 1000 and 3000 views in a
+row), field (1024 views to and fro over a field).
 """
 
 from __future__ import annotations
@@ -17,16 +18,19 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
-from bundle_problems import CASES, CONSTANT_TRACKS, Bundle, along_a_wall, golden, of_the_table
+from bundle_problems import CASES, CONSTANT_TRACKS, Bundle, along_a_wall, golden, of_the_table, over_a_field
 from case import Case, run
 
-from xalign_ros.core.bundle import Bundled
+from xalign_ros.core.bundle import DOWN, Bundled
+from xalign_ros.core.bundle_problem import Problem
+from xalign_ros.core.reconstruction import Reconstruction
 from xalign_ros.io.colmap import write_model
 from xalign_ros.io.colmap_conversion import model_of_reconstruction
 
@@ -87,7 +91,35 @@ def wall(case: Case) -> None:
     ours, theirs, done, answer = beside(problem, [partial(colmap, problem, 1), partial(colmap, problem, 2)], 3)
     case.figure("peer: pycolmap, the faster of one and two threads, s", statistics.median(theirs))
     case.figure("times faster than pycolmap", statistics.median(b / a for a, b in zip(ours, theirs, strict=True)))
+    case.figure("cost over pycolmap's, minus one", done.cost / answer["cost"] - 1, high=1e-6)
     case.figure("peer: pycolmap, RMSE of cameras, m", problem.rmse(np.array(answer["t"])))
+
+
+def chain(case: Case) -> None:
+    """Time and memory should grow as the views do."""
+    each = [_large(case, f"{n} views", along_a_wall(n, 20 * n), 3 if n < 3000 else 1) for n in (500, 1000, 3000)]
+    case.figure("s an observation and iteration, 3000 views over 500", each[-1] / each[0], high=2)
+
+
+def field(case: Case) -> None:
+    _large(case, "1024 views", over_a_field(32, 20), 3)
+
+
+def _large(case: Case, name: str, problem: Bundle, times: int) -> float:
+    """The least seconds of ours an observation and iteration."""
+    ours, theirs, done, answer = beside(problem, [partial(colmap, problem, 1), partial(colmap, problem, 2)], times)
+    equations, dense = _problem(problem.start, problem).system.storage, (6 * len(problem.truth)) ** 2 * 8
+    case.figure(f"{name}: observations", done.observations)
+    case.figure(f"{name}: s", statistics.median(ours))
+    case.figure(f"{name}: peer: pycolmap, the faster of one and two threads, s", statistics.median(theirs))
+    ratio = statistics.median(b / a for a, b in zip(ours, theirs, strict=True))
+    case.figure(f"{name}: times faster than pycolmap", ratio, low=1)
+    case.figure(f"{name}: cost over pycolmap's, minus one", done.cost / answer["cost"] - 1, high=1e-6)
+    case.figure(f"{name}: reduced system, MB", equations / 1e6)
+    case.figure(f"{name}: of a dense one", equations / dense, high=0.25)
+    case.figure(f"{name}: RMSE of cameras, m", problem.rmse(done.reconstruction.t))
+    case.figure(f"{name}: peer: pycolmap, RMSE of cameras, m", problem.rmse(np.array(answer["t"])))
+    return min(ours) / done.observations / done.iterations
 
 
 def beside(
@@ -139,6 +171,7 @@ def colmap(problem: Bundle, threads: int) -> dict[str, Any]:
     options.refine_focal_length = options.refine_extra_params = options.print_summary = False
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.max_num_images_direct_sparse_cpu_solver = 1_000_000  # beyond 1000 it would iterate, many times slower
     images = sorted(model.images.values(), key=lambda image: int(image.name))
     for image in images:
         config.add_image(image.image_id)
@@ -148,11 +181,25 @@ def colmap(problem: Bundle, threads: int) -> dict[str, Any]:
     start = time.perf_counter()
     summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     seconds = time.perf_counter() - start
-    t = [image.projection_center().tolist() for image in images]
-    return {"seconds": seconds, "cost": 0.0, "t": t, "summary": summary}
+    r, t = problem.start, np.array([image.projection_center() for image in images])
+    R = np.array([image.cam_from_world().rotation.matrix().T for image in images])
+    X = np.array([model.points3D[k].xyz for k in r.track_ids.tolist()])
+    cost = _problem(replace(r, R=R, t=t, points=X), problem).start.cost
+    return {"seconds": seconds, "cost": cost, "t": t, "summary": summary}
 
 
-CASES_OF = {"golden": golden_problems, "n60": of_table(60), "n240": of_table(240), "wall": wall}
+def _problem(r: Reconstruction, problem: Bundle) -> Problem:
+    return Problem(r, (), problem.constant_views, None, None, None, DOWN, True)
+
+
+CASES_OF = {
+    "golden": golden_problems,
+    "n60": of_table(60),
+    "n240": of_table(240),
+    "wall": wall,
+    "chain": chain,
+    "field": field,
+}
 
 if __name__ == "__main__":
     sys.exit(run(__doc__, CASES_OF))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from graph_problems import GOLDEN
+from scipy.spatial import cKDTree
 
 from xalign_ros.core.bundle import Bundled, adjust
 from xalign_ros.core.bundle_factors import PoseEdges
@@ -33,7 +34,7 @@ class Bundle:
     edges: tuple[PoseEdges, ...] = ()
     constant_views: np.ndarray | None = None
     constant_tracks: np.ndarray | None = None
-    words: dict[str, Any] = field(default_factory=dict)  # what only pyTheia is told
+    inverse_depth: bool = False
 
     def adjusted(self) -> Bundled:
         return adjust(
@@ -41,6 +42,7 @@ class Bundle:
             edges=self.edges,
             constant_views=self.constant_views,
             constant_tracks=self.constant_tracks,
+            inverse_depth=self.inverse_depth,
         )
 
     def rmse(self, t: np.ndarray) -> float:
@@ -61,7 +63,7 @@ class Bundle:
             weights=np.zeros(4) if edge is None else edge.weights[0],
             constant_views=none if self.constant_views is None else np.flatnonzero(self.constant_views),
             constant_tracks=none if self.constant_tracks is None else np.flatnonzero(self.constant_tracks),
-            inverse_depth=self.words.get("inverse_depth", False),
+            inverse_depth=self.inverse_depth,
         )  # fmt: skip
 
 
@@ -88,7 +90,7 @@ def of_the_table(n: int, case: str) -> Bundle:
     R, c = np.swapaxes(z["init_R"], 1, 2), z["init_c"]
     start = _reconstruction(R, c, X, z["obs"], z["intrinsics"], _priors(z, POSITION, ORIENTATION))
     edges = (chain(R, c, EDGES[case]),) if case in EDGES else ()
-    return Bundle(start, z["gt_c"], edges, constant_tracks=constant, words={"inverse_depth": case == INVERSE_DEPTH})
+    return Bundle(start, z["gt_c"], edges, constant_tracks=constant, inverse_depth=case == INVERSE_DEPTH)
 
 
 def along_a_wall(views: int, tracks: int, seed: int = 0) -> Bundle:
@@ -108,18 +110,24 @@ def along_a_wall(views: int, tracks: int, seed: int = 0) -> Bundle:
     view = (born[:, None] + near).ravel()
     track = np.repeat(np.arange(tracks), len(near))
     there = (view >= 0) & (view < views)
-    view, track = view[there], track[there]
-    uv, valid = camera.project(np.einsum("mji,mj->mi", R[view], X[track] - t[view]))
-    seen = valid & camera.inside(uv)
-    seen &= (np.bincount(track[seen], minlength=tracks) >= 3)[track]
-    kept, track = np.unique(track[seen], return_inverse=True)
-    obs = np.c_[view[seen], track, uv[seen] + rng.normal(0, 0.5, (int(seen.sum()), 2))]
-    held = (k < 2) | (k == views - 1)
-    start_R = R @ so3_exp(np.where(held[:, None], 0, rng.normal(0, 0.005, (views, 3))))
-    start_t = t + np.where(held[:, None], 0, rng.normal(0, 0.02, (views, 3)))
-    start_X = X[kept] + rng.normal(0, 0.05, (len(kept), 3))
-    start = _reconstruction(start_R, start_t, start_X, obs, np.array([800.0, 640, 360, 1280, 720]), None)
-    return Bundle(start, t, constant_views=held)
+    return _shaken(rng, camera, R, t, X, view[there], track[there], (k < 2) | (k == views - 1))
+
+
+def over_a_field(rows: int, tracks_per_view: int, seed: int = 0) -> Bundle:
+    """rows^2 views to and fro over ground 5 m below, 2 m and 1.2 m apart, each sharing tracks with some 90 others.
+
+    No order of the views keeps neighbours near each other. Noise and start as along_a_wall; the first two views are true.
+    """
+    rng, v, n = np.random.default_rng(seed), rows * rows, tracks_per_view * rows * rows
+    camera = Camera("radtan", [800.0, 800.0, 640.0, 360.0], [], 1280, 720)
+    row, column = np.divmod(np.arange(v), rows)
+    column = np.where(row % 2 == 1, rows - 1 - column, column)
+    t = np.c_[2.0 * column, 1.2 * row, 0.1 * np.sin(np.arange(v) / 7)]
+    R = so3_exp(rng.normal(0, 0.03, (v, 3)))
+    X = np.c_[rng.uniform(-2, 2 * rows, n), rng.uniform(-1, 1.2 * rows, n), rng.uniform(4, 6, n)]
+    view = cKDTree(t[:, :2]).query(X[:, :2], k=14)[1].ravel()
+    track = np.repeat(np.arange(n), 14)
+    return _shaken(rng, camera, R, t, X, view, track, np.arange(v) < 2)
 
 
 def chain(R: np.ndarray, t: np.ndarray, weights: tuple[float, ...]) -> PoseEdges:
@@ -128,6 +136,30 @@ def chain(R: np.ndarray, t: np.ndarray, weights: tuple[float, ...]) -> PoseEdges
     return PoseEdges(
         n, n + 1, Rt @ R[1:], np.einsum("nij,nj->ni", Rt, np.diff(t, axis=0)), np.tile(weights, (len(n), 1))
     )
+
+
+def _shaken(
+    rng: np.random.Generator,
+    camera: Camera,
+    R: np.ndarray,
+    t: np.ndarray,
+    X: np.ndarray,
+    view: np.ndarray,
+    track: np.ndarray,
+    held: np.ndarray,
+) -> Bundle:
+    """Of a true world what its views see, from three on, with noise; all but the held views and all points are off."""
+    uv, valid = camera.project(np.einsum("mji,mj->mi", R[view], X[track] - t[view]))
+    seen = valid & camera.inside(uv)
+    seen &= (np.bincount(track[seen], minlength=len(X)) >= 3)[track]
+    kept, track = np.unique(track[seen], return_inverse=True)
+    obs = np.c_[view[seen], track, uv[seen] + rng.normal(0, 0.5, (int(seen.sum()), 2))]
+    start_R = R @ so3_exp(np.where(held[:, None], 0, rng.normal(0, 0.005, R.shape[:2])))
+    start_t = t + np.where(held[:, None], 0, rng.normal(0, 0.02, t.shape))
+    start_X = X[kept] + rng.normal(0, 0.05, (len(kept), 3))
+    intrinsics = np.array([camera.K[0], *camera.K[2:], camera.width, camera.height])
+    start = _reconstruction(start_R, start_t, start_X, obs, intrinsics, None)
+    return Bundle(start, t, constant_views=held)
 
 
 def _priors(z: Any, position: float, orientation: float) -> PosePriors:

@@ -53,6 +53,11 @@ class Reduced:
         self.node, self.count = self._layout.node, self._layout.count
         self._border = Border(column, intrinsics.width, intrinsics.count, self.count)
 
+    @property
+    def storage(self) -> int:
+        """Bytes of the reduced system, which is not dense over views."""
+        return self._layout.system.flat.nbytes
+
     def build(
         self,
         at: Linearized,
