@@ -10,7 +10,7 @@ from case import Case, run
 
 from xalign_ros.core.aligner import Aligner
 from xalign_ros.core.config import Config
-from xalign_ros.core.faults import FAULTS, Arrivals, faulty
+from xalign_ros.core.faults import FAULTS, Arrivals, faulty, faulty_map
 from xalign_ros.core.lie import so3_log
 from xalign_ros.core.map_building import build_map
 from xalign_ros.core.records import Keyframe, State
@@ -55,7 +55,7 @@ def fault(name: str, case: Case) -> None:
     wrong, ends, ratios, largest, lost = 0, 0, [], [], []
     for seed in range(SEEDS):
         map_, drive, truth = simulated(seed)
-        errors, bad, states = aligned(map_, faulty(drive, name, seed), truth)
+        errors, bad, states = aligned(faulty_map(map_, name, seed), faulty(drive, name, seed), truth)
         wrong += bad
         ends += states[-1] is State.LOCALIZED
         ratios.append(float(np.median(errors)) / max(undisturbed(seed), 0.005))

@@ -7,7 +7,7 @@ import pytest
 import worlds
 
 from xalign_ros.core.aligner import Aligner
-from xalign_ros.core.faults import FAULTS, faulty
+from xalign_ros.core.faults import FAULTS, faulty, faulty_map
 from xalign_ros.core.lie import so3_log
 from xalign_ros.core.records import State
 
@@ -15,7 +15,7 @@ from xalign_ros.core.records import State
 @pytest.mark.parametrize("name", FAULTS)
 def test_no_wrong_pose_is_localized_and_the_run_ends_localized(name) -> None:
     map_, run, truth = worlds.simulated("corridor", 0)
-    aligner, errors = Aligner(map_), []
+    aligner, errors = Aligner(faulty_map(map_, name, 0)), []
     for _, keyframe in faulty(run, name, 0):
         step = aligner.step(keyframe)
         if step.correction is not None:
@@ -49,8 +49,28 @@ def test_the_same_seed_breaks_the_same_and_the_run_stays_as_it_was() -> None:
         one, two = ([(ns, k.id, k.stamp_ns, k.session) for ns, k in faulty(run, name, 3)] for _ in range(2))
         assert one == two
     assert [k.stamp_ns for k in run] == sorted({k.stamp_ns for k in run})
-    with pytest.raises(ValueError, match="'gremlins' is not one of swapped"):
-        faulty(run, "gremlins", 0)
+    for broken in (lambda: faulty(run, "gremlins", 0), lambda: faulty_map(worlds.line().map, "gremlins", 0)):
+        with pytest.raises(ValueError, match="'gremlins' is not one of swapped"):
+            broken()
+
+
+def test_a_moved_block_is_moved_as_one_and_gives_anchors_that_are_refused() -> None:
+    map_, run, truth = worlds.simulated("corridor", 0)
+    moved = faulty_map(map_, "moved_block", 0)
+    assert faulty_map(map_, "dark", 0) is map_
+    block = np.flatnonzero((moved.points != map_.points).any(axis=1))
+    assert 20 < len(block) < len(map_.points) / 2
+    pairs = np.random.default_rng(0).choice(block, (50, 2))
+    distances = [np.linalg.norm(m.points[pairs[:, 0]] - m.points[pairs[:, 1]], axis=1) for m in (map_, moved)]
+    np.testing.assert_allclose(*distances, atol=1e-9)
+    aligner, wrong = Aligner(moved), 0
+    for keyframe in run:
+        step = aligner.step(keyframe)
+        if step.rejection is not None and step.rejection.anchor is not None:
+            wrong += np.linalg.norm(step.rejection.anchor.T_map_cam.t - truth[keyframe.id].t) > 0.5
+        if step.anchor is not None:
+            assert np.linalg.norm(step.anchor.T_map_cam.t - truth[keyframe.id].t) < 0.5
+    assert wrong > 0
 
 
 def test_the_document_has_every_fault() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from xalign_ros.core.config import Config
 from xalign_ros.core.errors import ConfigError, FormatError
-from xalign_ros.core.faults import FAULTS, Arrivals, faulty
+from xalign_ros.core.faults import FAULTS, Arrivals, faulty, faulty_map
 from xalign_ros.core.map_building import build_map
 from xalign_ros.core.simulation import WORLDS, driving, mapping, world
 from xalign_ros.core.transforms import SE3
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="same seed, same bytes; default 0")
     parser.add_argument("--keyframes", type=int, default=300, metavar="N", help="of the run, 0.4 m apart; default 300")
     parser.add_argument(
-        "--fault", choices=FAULTS, metavar="NAME", help=f"what goes wrong with the run: {', '.join(FAULTS)}"
+        "--fault", choices=FAULTS, metavar="NAME", help=f"what goes wrong with the run or its map: {', '.join(FAULTS)}"
     )
     parser.add_argument("--metric", action="store_true", help="an odometry in metres, as VIO's")
 
@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> None:
     posed = mapping(built, args.seed)
     source = f"xalign simulate --world {args.world} --seed {args.seed}"
     map_ = build_map(posed, built.mapped, map_id=args.world, source=source, metric=True, progress=progress_bar)
+    map_ = faulty_map(map_, args.fault, args.seed) if args.fault else map_
     drive = driving(built, args.seed, Config().odometry, metric=args.metric)
     arrivals = faulty(drive, args.fault, args.seed) if args.fault else [(k.stamp_ns, k) for k in drive]
     args.output.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What goes wrong with keyframes on the way to the aligner, on purpose and by seed, and what it must make of that."""
+"""What goes wrong with keyframes and maps before the aligner has them, on purpose and by seed, and what must come of it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from xalign_ros.core.lie import so3_exp
 from xalign_ros.core.records import Features, Keyframe
+from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3
 
 Arrivals = list[tuple[int, Keyframe]]  # (ns, keyframe) in the order in which they come
@@ -17,11 +18,12 @@ LATE_NS = 2_000_000_000
 CLOCK_NS = 1000 * 1_000_000_000
 SCALE = 1.5
 DARK = 20  # keyframes
+BLOCK_M, MOVED_M, TURNED_RAD = 2.0, 1.0, 0.05  # radius of a block of map points, and how far it is moved
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """`change` makes it of a run; `words` say what it is, `must` what the aligner should make of it.
+    """`change` makes it of a run or `change_map` of a map; `words` say what it is, `must` what should come of it.
 
     Whatever it is: no pose over 0.5 m or 5 deg off may be LOCALIZED, the run must end LOCALIZED, and the median error of
     its poses be within 1.5 times the undisturbed run's, or 7.5 mm.
@@ -30,6 +32,7 @@ class Fault:
     change: Callable[[Arrivals, np.random.Generator], Arrivals]
     words: str
     must: str
+    change_map: Callable[[ReferenceMap, np.random.Generator], ReferenceMap] = lambda map_, _: map_
 
 
 def _swapped(run: Arrivals, rng: np.random.Generator) -> Arrivals:
@@ -103,6 +106,22 @@ def _dark(run: Arrivals, rng: np.random.Generator) -> Arrivals:
     return out
 
 
+def _moved_block(map_: ReferenceMap, rng: np.random.Generator) -> ReferenceMap:
+    """As of shelves that were moved since: points that agree with each other, where the first quarter of the map's way ends.
+
+    In a corridor they outnumber all else for up to ten keyframes; a lock withstands so many (`lock.cap`).
+    """
+    points, seen = np.array(map_.points), np.asarray(map_.feature_point)
+    k = int(len(map_.keyframe_t) * rng.uniform(0.22, 0.28))
+    before = seen[map_.features_of(k)]
+    middle = np.median(points[before[before >= 0]], axis=0)
+    angle = rng.uniform(0, 2 * np.pi)
+    T = SE3(so3_exp([0, 0, TURNED_RAD]), MOVED_M * np.array([np.cos(angle), np.sin(angle), 0]))
+    block = np.linalg.norm(points - middle, axis=1) < BLOCK_M
+    points[block] = T.apply(points[block] - middle) + middle
+    return replace(map_, points=points, visibility=None)
+
+
 FAULTS = {
     "swapped": Fault(_swapped, "a fifth of the keyframes sees what another one saw", "refused, not believed"),
     "dropped": Fault(_dropped, "30 % of the keyframes never come", "goes on"),
@@ -115,12 +134,27 @@ FAULTS = {
     "clock_forward": Fault(_clock_forward, "half-way the clock jumps 1000 s ahead", "goes on, or locks anew"),
     "clock_back": Fault(_clock_back, "half-way the clock jumps 1000 s back", "begins anew where it stays back"),
     "dark": Fault(_dark, f"{DARK} keyframes without a feature", "coasts on the odometry"),
+    "moved_block": Fault(
+        lambda run, _: run,
+        f"the map's points within {BLOCK_M:g} m of a place stand {MOVED_M:g} m and {np.rad2deg(TURNED_RAD):.0f} deg off",
+        "its anchors are refused, not believed",
+        _moved_block,
+    ),
 }
 
 
 def faulty(run: Sequence[Keyframe], name: str, seed: int) -> Arrivals:
     """A run whose keyframes came at their stamps, with one of FAULTS. Raises ValueError on another name."""
+    arrivals = [(k.stamp_ns, k) for k in run]
+    return _fault(name).change(arrivals, np.random.default_rng([5, seed]))
+
+
+def faulty_map(map_: ReferenceMap, name: str, seed: int) -> ReferenceMap:
+    """The run's map with one of FAULTS: itself where that breaks the run only. Raises ValueError on another name."""
+    return _fault(name).change_map(map_, np.random.default_rng([7, seed]))
+
+
+def _fault(name: str) -> Fault:
     if name not in FAULTS:
         raise ValueError(f"fault '{name}' is not one of {', '.join(FAULTS)}")
-    arrivals = [(k.stamp_ns, k) for k in run]
-    return FAULTS[name].change(arrivals, np.random.default_rng([5, seed]))
+    return FAULTS[name]
