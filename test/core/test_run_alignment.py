@@ -118,7 +118,8 @@ def test_priors_cost_in_bundle_adjustment_what_the_covariance_of_their_anchors_s
     cov[:, :3, :3], cov[:, 3:, 3:] = A[:, 0], A[:, 1]
     T = [SE3.exp(rng.normal(size=6)) for _ in range(n)]
     anchors = {k: Anchor(k, 0, k, T[k], cov[k], 50, 40, 1.0) for k in range(n)}
-    d = rng.normal(0, 0.8, (n, 6))  # right tangents, rotations up to two radians
+    d = rng.normal(0, 0.8, (n, 6))  # right tangents; a rotation beyond pi would be another one
+    d[:, :3] *= np.minimum(1, 2 / np.linalg.norm(d[:, :3], axis=1, keepdims=True))
     moved = [SE3(x.R @ so3_exp(e[:3]), x.t + x.R @ e[3:]) for x, e in zip(T, d, strict=True)]
     want = 0.5 * sum(e @ np.linalg.solve(c, e) for e, c in zip(d, cov, strict=True))
     run = Reconstruction.of_views(np.array([x.R for x in moved]), np.array([x.t for x in moved]))
