@@ -26,7 +26,7 @@ from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
 from xalign_ros.apps.node_diagnostics import diagnostics_message, inputs, localization, resources
-from xalign_ros.apps.node_endpoints import LOSSY, QUEUE, STATIC, TEN
+from xalign_ros.apps.node_endpoints import FAST, QUEUE, STATIC, TEN
 from xalign_ros.apps.node_inputs import Inputs
 from xalign_ros.apps.node_localizer import Localizer
 from xalign_ros.apps.node_parameters import declare_parameters, read_parameters, refuse_unknown, told_as
@@ -104,7 +104,7 @@ class XalignNode(LifecycleNode):
                     for ear in self.localizer.source.ears():
                         take = partial(self.localizer.source.take, ear.role)
                         subscribe(*ear.topic, ear.qos, ear.most_bytes, take, raw=ear.role in IMAGES, part=ear.part)
-                subscribe("odometry", ODOMETRY, LOSSY, ODOMETRY_BYTES, self._on_odometry, part="odometry")
+                subscribe("odometry", ODOMETRY, FAST, ODOMETRY_BYTES, self._on_odometry, part="odometry")
                 subscribe("/tf_static", TF, STATIC, TREE_BYTES, self._on_static)
                 posed = "geometry_msgs/msg/PoseWithCovarianceStamped"
                 subscribe("initialpose", posed, TEN, ODOMETRY_BYTES, self._on_initialpose)

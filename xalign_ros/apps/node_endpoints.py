@@ -18,6 +18,7 @@ from xalign_ros.io.view_messages import JUMP, MAP_POINTS, VIEWS
 
 QUEUE, TEN, TRANSFORMS = QoSProfile(depth=KEYFRAME_QUEUE), QoSProfile(depth=10), QoSProfile(depth=100)
 LOSSY = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+FAST = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)  # a quarter of a second of odometry at 200 Hz
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 GATED = ("odometry_smooth", "odometry_scaled")  # made only where somebody listens, as the VIEWS are
