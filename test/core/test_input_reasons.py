@@ -20,7 +20,6 @@ from xalign_ros.io import messages
 from xalign_ros.io.log import typestore
 
 CONFIG = Config()
-TIGHT = np.diag([1e-3] * 3 + [1e-2] * 3) ** 2
 AT = 12
 
 
