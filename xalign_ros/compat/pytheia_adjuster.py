@@ -12,9 +12,10 @@ from xalign_ros.compat.pytheia_bundle_options import (
     BundleAdjustmentSummary,
     GravityPriorErrorType,
 )
-from xalign_ros.compat.pytheia_reconstruction import Reconstruction
+from xalign_ros.compat.pytheia_reconstruction import Reconstruction, Track
 from xalign_ros.compat.pytheia_record import pose_edges, record, views_and_tracks
 from xalign_ros.compat.pytheia_structs import RelativePoseConstraint
+from xalign_ros.compat.pytheia_views import View
 from xalign_ros.core import reconstruction as core
 from xalign_ros.core.bundle import adjust, covariances
 from xalign_ros.core.lie import Array
@@ -39,23 +40,19 @@ class BundleAdjuster:
 
     def AddView(self, view_id: int) -> None:
         """A view that is not estimated is skipped, and told in the summary. Raises ValueError on an unknown one."""
-        view = self._reconstruction.View(int(view_id))
-        if view is None:
-            raise ValueError(f"view {view_id} is not in the reconstruction")
-        if view.IsEstimated():
-            self._views.add(int(view_id))
-        else:
-            self._skipped.append(f"view {view_id} is not estimated, it stays")
+        self._add("view", int(view_id), self._reconstruction.View(int(view_id)), self._views)
 
     def AddTrack(self, track_id: int, use_homogeneous: bool = True) -> None:
         """As AddView. use_homogeneous says nothing here."""
-        track = self._reconstruction.Track(int(track_id))
-        if track is None:
-            raise ValueError(f"track {track_id} is not in the reconstruction")
-        if track.IsEstimated():
-            self._tracks.add(int(track_id))
+        self._add("track", int(track_id), self._reconstruction.Track(int(track_id)), self._tracks)
+
+    def _add(self, kind: str, number: int, found: View | Track | None, into: set[int]) -> None:
+        if found is None:
+            raise ValueError(f"{kind} {number} is not in the reconstruction")
+        if found.IsEstimated():
+            into.add(number)
         else:
-            self._skipped.append(f"track {track_id} is not estimated, it stays")
+            self._skipped.append(f"{kind} {number} is not estimated, it stays")
 
     def AddRelativePoseConstraint(self, constraint: RelativePoseConstraint) -> None:
         """Its measurement is the relative pose of its views when Optimize is called."""

@@ -66,14 +66,11 @@ def shared_covariance(influence: Array, xyz: Array, cov: Array, sources: Sources
     moves[:, :, :3] = hat(x)
     moves[:, :, 3:] = EYE3 - x[:, :, None] * (x / range2[:, None])[:, None]
     moves /= (range2 * sources.sigma_rad**2)[:, None, None]
-    at = ((3 * sources.point[:, None] + np.arange(3)) * len(keyframes) + keyframe[:, None])[:, :, None] * 6 + np.arange(
-        6
-    )
+    row = 3 * sources.point[:, None] + np.arange(3)
+    at = 6 * (row * len(keyframes) + keyframe[:, None])[:, :, None] + np.arange(6)
     by_point = np.bincount(at.ravel(), moves.ravel(), minlength=len(xyz) * len(keyframes) * 18)
     D = (influence @ cov).swapaxes(0, 1).reshape(influence.shape[1], -1)
-    G = (D @ by_point.reshape(3 * len(xyz), -1)).reshape(
-        len(D), -1, 2, 3
-    )  # of each keyframe: by its turn, by its shift
+    G = (D @ by_point.reshape(3 * len(xyz), -1)).reshape(len(D), -1, 2, 3)  # of each keyframe: by its turn, its shift
     rotation, position = (part @ part.T for part in np.moveaxis(G, 2, 0).reshape(2, len(D), -1))
     return rotation, position
 

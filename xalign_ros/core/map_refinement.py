@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import bsr_array, csc_array
 from scipy.sparse.linalg import splu
 
-from xalign_ros.core.lie import Array, hat, se3_log
+from xalign_ros.core.lie import Array, se3_log, turn_and_shift
 from xalign_ros.core.transforms import SE3
 from xalign_ros.core.triangulation import tangent_basis
 
@@ -87,7 +87,7 @@ def _step(
     J_cam = (basis - np.einsum("oij,oj->oi", basis, u)[:, :, None] * u[:, None, :]) / range_[:, None, None]
     root = np.sqrt(np.minimum(1, HUBER / np.maximum(np.linalg.norm(r, axis=1), 1e-12)))[:, None]
     r, J_cam = r * root, J_cam * root[:, :, None]
-    J_pose = np.concatenate([J_cam @ hat(x_cam), -J_cam], axis=2)
+    J_pose = turn_and_shift(J_cam, x_cam).T
     J_point = J_cam @ np.swapaxes(np.array([T.R for T in poses])[obs.keyframe], 1, 2)
 
     def summed(index: np.ndarray, values: Array, count: int) -> Array:

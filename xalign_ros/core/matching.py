@@ -10,9 +10,11 @@ from xalign_ros.core.camera import Camera
 from xalign_ros.core.config import Matching
 from xalign_ros.core.descriptors import indexed_distance, nearest
 from xalign_ros.core.lie import Array, turn_and_shift
+from xalign_ros.core.pnp import upper_median
 from xalign_ros.core.records import Features
 from xalign_ros.core.reference_map import MapIndex, ReferenceMap
 from xalign_ros.core.transforms import SE3
+from xalign_ros.core.vocabulary import slices
 
 ELLIPSE_SIGMAS = 3.0  # that a prediction is searched within
 LEAST_BAND_PX = 20.0  # more bands cost more than they save
@@ -92,7 +94,7 @@ def _inside_ellipses(uv: Array, centre: Array, S: Array, most_px: float) -> tupl
     a, b, c = S * np.minimum(ELLIPSE_SIGMAS**2, most_px**2 / largest)
     # (c du^2 - 2 b du dv + a dv^2) / (a c - b^2) <= 1
     weights, half_u, half_v = np.array([c, -2 * b, a]) / (a * c - b * b), np.sqrt(a), np.sqrt(c)
-    height = max(float(np.partition(half_v, len(half_v) // 2)[len(half_v) // 2]), LEAST_BAND_PX)
+    height = max(upper_median(half_v), LEAST_BAND_PX)
     band = np.floor(uv[:, 1] / height)
     wide = 2 * float(np.abs(uv[:, 0]).max()) + 1  # a band's range of keys, u in the middle of it
     key = band * wide + uv[:, 0]
@@ -102,25 +104,19 @@ def _inside_ellipses(uv: Array, centre: Array, S: Array, most_px: float) -> tupl
     high = np.minimum(np.floor((v_0 + half_v) / height), band.max())
     bands = np.maximum(high - low + 1, 0).astype(np.int64)
     centres = np.repeat(np.arange(len(centre)), bands)
-    edge = _counted(bands, low.astype(np.int64)) * wide
+    edge = slices(low.astype(np.int64), bands) * wide
     left, right = np.clip([u_0 - half_u, u_0 + half_u], -wide / 2, wide / 2)[:, centres]
     first = np.searchsorted(key, edge + left)
     counts = np.searchsorted(key, edge + right, side="right") - first
     rows, found = [], []
     for part in np.array_split(np.arange(len(counts)), 1 + int(counts.sum()) // AT_ONCE):
-        at, row = np.repeat(centres[part], counts[part]), _counted(counts[part], first[part])
+        at, row = np.repeat(centres[part], counts[part]), slices(first[part], counts[part])
         du, dv = u[row] - u_0[at], v[row] - v_0[at]
         w = weights[:, at]
         inside = np.flatnonzero((w[0] * du + w[1] * dv) * du + w[2] * dv * dv <= 1)
         rows.append(order[row[inside]])
         found.append(at[inside])
     return np.concatenate(rows), np.concatenate(found)
-
-
-def _counted(counts: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """first[n], first[n] + 1, ..., counts[n] of them, for each n."""
-    end = np.cumsum(counts)
-    return np.repeat(first - end + counts, counts) + np.arange(end[-1] if len(end) else 0)
 
 
 def place_matches(features: Features, index: MapIndex, keyframes: np.ndarray, config: Matching) -> Matches:

@@ -13,7 +13,7 @@ from xalign_ros.core.lie import Array
 from xalign_ros.core.map_error import Sources
 from xalign_ros.core.records import Norm
 from xalign_ros.core.transforms import SE3, Sim3
-from xalign_ros.core.vocabulary import Vocabulary
+from xalign_ros.core.vocabulary import Vocabulary, slices
 
 LEAST_VIEW_COSINE = 0.5  # to the mean direction a point was seen from (ORB-SLAM, Mur-Artal et al. 2015, section V-D)
 MASK_COST = 20  # entries of a mask over all points that take the time of sorting one point
@@ -206,7 +206,7 @@ class MapIndex:
         v = self.visibility
         first = v.point_offset[points]
         counts = v.point_offset[points + 1] - first
-        rows = np.repeat(first - np.r_[0, np.cumsum(counts)[:-1]], counts) + np.arange(counts.sum())
+        rows = slices(first, counts)
         return v.point_keyframe[rows], counts
 
     def covisible(self, keyframe: int, count: int) -> np.ndarray:

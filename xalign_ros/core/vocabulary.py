@@ -72,8 +72,7 @@ class Vocabulary:
             return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
         word, row = self._probed(_vectors(query, norm))
         first, size = self.word_offset[word], self.word_offset[word + 1] - self.word_offset[word]
-        end = np.cumsum(size)
-        place = np.repeat(first - (end - size), size) + np.arange(end[-1])
+        place = slices(first, size)
         row = np.repeat(row, size)
         begin = np.searchsorted(row, np.arange(len(query) + 1))
         query_code = columns(_codes(query, norm))
@@ -146,6 +145,12 @@ def _means(x: Array, count: int) -> tuple[Array, np.ndarray]:
         own, first = np.unique(home[order], return_index=True)  # a mean that nothing is nearest to stays where it is
         means[own] = np.add.reduceat(x[order], first, axis=0) / np.diff(np.r_[first, len(x)])[:, None]
     return means, _nearest(x, means)
+
+
+def slices(first: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """first[n], first[n] + 1, ..., counts[n] of them, one after the other for each n."""
+    end = np.cumsum(counts)
+    return np.asarray(np.repeat(first - end + counts, counts) + np.arange(end[-1] if len(end) else 0))
 
 
 def _nearest(x: Array, means: Array) -> np.ndarray:

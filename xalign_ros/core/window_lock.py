@@ -13,7 +13,7 @@ import numpy as np
 import poselib
 
 from xalign_ros.core.config import Config
-from xalign_ros.core.lie import Array, hat
+from xalign_ros.core.lie import Array, turn_and_shift
 from xalign_ros.core.odometry import pose_covariance
 from xalign_ros.core.pnp import Points2D3D
 from xalign_ros.core.records import Keyframe
@@ -170,6 +170,6 @@ class _Window:
             rows, x_cam, uv, J_cam = rows[valid], x_cam[valid], uv[valid], J_cam[valid]
             sigma = self._sigma_px(S, np.maximum(np.linalg.norm(x_cam, axis=1), 1e-12), rows)[:, None]
             r[rows] = (uv - self.uv[rows]) / sigma
-            J[rows] = np.concatenate([J_cam @ hat(x_cam), -J_cam], axis=2) / sigma[:, None]
+            J[rows] = turn_and_shift(J_cam, x_cam).T / sigma[:, None]
             size[rows] = np.linalg.norm(r[rows], axis=1)
         return r, J, A, size
