@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from xalign_ros.core.lie import Array, so3_log
 from xalign_ros.io.report_page import filled, picture, write_folder
-from xalign_ros.io.report_run import direction
+from xalign_ros.io.report_run import direction, plane_of
 from xalign_ros.io.report_style import (
     BLUE,
     GREEN,
@@ -124,14 +124,12 @@ def _joined(trajectory: Trajectory, values: Array) -> tuple[np.ndarray, Array]:
 
 def _ways(runs: Sequence[Compared], truth: Trajectory) -> Figure:
     """In the plane of the truth's two principal axes."""
-    d = truth.t - truth.t.mean(axis=0)
-    right, across = np.linalg.eigh(d.T @ d)[1].T[[2, 1]]
-    axes = np.array([a * np.copysign(1, a[np.abs(a).argmax()]) for a in (right, across)])
+    axes, view = plane_of(truth.t, truth.R)
     shown = np.vstack([truth.t, *(run.trajectory.t for run in runs)]) @ axes.T
     low, high = np.percentile(shown, [0.5, 99.5], axis=0)
     half = np.maximum(0.56 * (high - low), 0.2 * (high - low).max() or 1.0)
     middle = (low + high) / 2
-    figure, (ax,) = panels("The ways, over each other", [(WIDTH_IN - 0.6) * float(half[1] / half[0])])
+    figure, (ax,) = panels(f"The ways, over each other{view}", [(WIDTH_IN - 0.6) * float(half[1] / half[0])])
     ax.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
     ax.set_aspect("equal", anchor="N")
     ax.set(xlabel=f"{direction(axes[0])} (m)", ylabel=f"{direction(axes[1])} (m)")

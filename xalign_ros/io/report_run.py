@@ -58,15 +58,20 @@ def positions(poses: Iterable[SE3 | None]) -> Array:
 
 
 def plane(path: Array, map_: ReferenceMap, points: Array) -> tuple[Array, str]:
-    """The path's two principal axes (2, 3), and the view in words; what the path leaves open, the map decides.
+    """As plane_of, what the path leaves open by the map."""
+    return plane_of(path, map_.keyframe_R, (map_.keyframe_t, points))
 
-    Up is where the cameras' up is; where they do not agree, z, or -y if the map has the axes of a camera.
+
+def plane_of(path: Array, R_map_cam: Array, around: Sequence[Array] = ()) -> tuple[Array, str]:
+    """The path's two principal axes (2, 3), and the view in words; what it leaves open, the positions `around` decide.
+
+    Up is where the cameras' (K, 3, 3) up is; where they do not agree, z, or -y if the map has the axes of a camera.
     """
     C = np.zeros((3, 3))
-    for weight, x in ((1.0, path), (1e-3, map_.keyframe_t), (1e-5, points)):
+    for weight, x in zip((1.0, 1e-3, 1e-5), (path, *around), strict=False):
         d = x - x.mean(axis=0) if len(x) else x
         C += weight * (d.T @ d) / max(float((d**2).sum()), 1e-30)
-    V, cameras = np.linalg.eigh(C)[1], -map_.keyframe_R[:, :, 1].mean(axis=0)
+    V, cameras = np.linalg.eigh(C)[1], -R_map_cam[:, :, 1].mean(axis=0)
     up = cameras if np.linalg.norm(cameras) > 0.7 else np.array([0.0, -1.0, 1.0])
     right = V[:, 2] * np.copysign(1, V[np.abs(V[:, 2]).argmax(), 2])
     normal = V[:, 0] * np.copysign(1, (V[:, 0] + 0.5 * np.cross(V[:, 0], right)) @ up)
