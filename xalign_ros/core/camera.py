@@ -30,8 +30,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from xalign_ros.core.camera_plane import FARTHEST, NO_JACOBIAN, PlaneDistortion, tilted
-from xalign_ros.core.camera_radial import RADIAL, angle_of, monotonic_limit
+from xalign_ros.core import kernels
+from xalign_ros.core.camera_plane import FARTHEST, PlaneDistortion, padded, tilted
+from xalign_ros.core.camera_radial import LENSES, angle_of, monotonic_limit
 from xalign_ros.core.lie import Array
 from xalign_ros.core.transforms import frozen
 
@@ -69,6 +70,7 @@ class Camera:
     limit: float = field(
         init=False, repr=False
     )  # largest radius (radtan) or angle (else) where the model is one to one
+    numbers: Array = field(init=False, repr=False)  # (34,) all of it, as src/camera.hpp has it
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", frozen(self.K, (4,), "Camera.K"))
@@ -99,24 +101,19 @@ class Camera:
         elif plane is not None:
             limit = plane.limit
         object.__setattr__(self, "limit", limit)
+        code = LENSES.index("equirectangular" if self.model == "equirectangular" else lens)
+        level = np.zeros(13) if plane is None else plane.numbers
+        tilt = np.full(9, np.nan) if plane is None or plane.tilt is None else plane.tilt.ravel()
+        numbers = np.concatenate([[code], padded(D, 6), level, tilt, [limit], self.K])
+        object.__setattr__(self, "numbers", frozen(numbers, (34,), "Camera.numbers"))
 
     def project(self, xyz_cam: ArrayLike) -> tuple[Array, np.ndarray]:
         """Pixels (N, 2) and validity (N,) of points (N, 3) of the camera frame; invalid rows are NaN."""
-        x = np.asarray(xyz_cam, float)
-        m, valid, _ = self._distort(x, False)
-        uv = self.K[:2] * m + self.K[2:]
-        uv[~valid] = np.nan
-        return uv, valid
+        return kernels.project(self.numbers, np.asarray(xyz_cam, float))[:2]
 
     def project_with_jacobian(self, xyz_cam: ArrayLike) -> tuple[Array, np.ndarray, Array]:
-        """Pixels (N, 2), validity (N,) and d uv / d xyz_cam (N, 2, 3); columns are contiguous where those of xyz_cam are."""
-        x = np.asarray(xyz_cam, float)
-        m, valid, J = self._distort(x, True)
-        uv = self.K[:2] * m + self.K[2:]
-        if not valid.all():
-            uv[~valid] = np.nan
-        J *= self.K[:2, None]
-        return uv, valid, J
+        """Pixels (N, 2), validity (N,) and d uv / d xyz_cam (N, 2, 3), columns contiguous; invalid rows mean nothing."""
+        return kernels.project(self.numbers, np.asarray(xyz_cam, float))
 
     def inside(self, uv: ArrayLike, border_px: float = 0.0) -> np.ndarray:
         """Whether pixels (N, 2) lie on the image, whose area reaches half a pixel beyond the outer centres."""
@@ -148,19 +145,6 @@ class Camera:
             rays, valid = np.column_stack([a * k[:, None], np.cos(angle)]), valid & reached
         return rays / np.linalg.norm(rays, axis=1, keepdims=True), valid
 
-    def _distort(self, x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:
-        """Distorted normalised points (N, 2), validity (N,), Jacobian to the camera point (N, 2, 3) if asked for."""
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            if self.model == "equirectangular":
-                return _longitude_latitude(x, jacobian)
-            if not self.lens[0]:
-                return _distort_pinhole(self, x, jacobian)
-            m, valid, J = _distort_radial(self, x, jacobian)
-            if self.plane is not None:
-                m, J_plane = self.plane.distort(m, jacobian)
-                J = J_plane @ J if jacobian else J
-            return m, valid, J
-
 
 def _parts(model: str, D: Array) -> tuple[str, Array, PlaneDistortion | None]:
     """The lens along the radius with its coefficients, and the distortion that follows; "" and None where there is none."""
@@ -185,57 +169,6 @@ def _opencv(d: tuple[float, ...]) -> PlaneDistortion | None:
     low = (k4, k5, k6) if k4 or k5 or k6 else ()
     tilt = tilted(tau_x, tau_y) if tau_x or tau_y else None
     return PlaneDistortion((k1, k2, k3) if k3 else (k1, k2), low, (p1, p2), (s1, s2, s3, s4), tilt)
-
-
-def _distort_pinhole(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:
-    z = x[:, 2]
-    near = 1 / z
-    a = x[:, :2] * near[:, None]
-    valid = (z > 1e-9) & (a[:, 0] * a[:, 0] + a[:, 1] * a[:, 1] <= camera.limit**2)
-    m, Ja = (a, NO_JACOBIAN) if camera.plane is None else camera.plane.distort(a, jacobian)
-    if not jacobian:
-        return m, valid, NO_JACOBIAN
-    J = np.zeros((len(x), 2, 3), order="F")
-    if camera.plane is None:
-        J[:, 0, 0] = J[:, 1, 1] = near
-        J[:, :, 2] = -a * near[:, None]
-    else:
-        J[:, :, :2] = Ja * near[:, None, None]
-        J[:, :, 2] = -J[:, :, 0] * a[:, :1] - J[:, :, 1] * a[:, 1:]
-    return m, valid, J
-
-
-def _distort_radial(camera: Camera, x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:
-    """m = (x, y) q / r with q a function of the angle between ray and axis."""
-    r, z = np.hypot(x[:, 0], x[:, 1]), x[:, 2]
-    lens, D = camera.lens
-    q, dq_dr, dq_dz = RADIAL[lens](D, r, z)
-    on_axis = r < 1e-9 * np.abs(z)
-    safe = np.where(on_axis, 1.0, r)
-    k = np.where(on_axis, dq_dr, q / safe)
-    m, valid = x[:, :2] * k[:, None], (np.arctan2(r, z) <= camera.limit) & (r * r + z * z > 1e-18)
-    if not jacobian:
-        return m, valid, NO_JACOBIAN
-    e = np.where(on_axis[:, None], 0.0, x[:, :2] / safe[:, None])
-    J = np.empty((len(x), 2, 3), order="F")
-    J[:, :, :2] = ((dq_dr - k)[:, None] * e)[:, :, None] * e[:, None, :]
-    J[:, 0, 0] += k
-    J[:, 1, 1] += k
-    J[:, :, 2] = dq_dz[:, None] * e
-    return m, valid, J
-
-
-def _longitude_latitude(x: Array, jacobian: bool) -> tuple[Array, np.ndarray, Array]:
-    """Longitude and latitude (N, 2) rad of points, whether they have a longitude (N,), Jacobian (N, 2, 3)."""
-    h = np.hypot(x[:, 0], x[:, 2])
-    m = np.stack([np.arctan2(x[:, 0], x[:, 2]), np.arctan2(x[:, 1], h)], 1)
-    valid = (h > 1e-9 * np.abs(x[:, 1])) & (h > 1e-9)
-    if not jacobian:
-        return m, valid, NO_JACOBIAN
-    J, n2 = np.zeros((len(x), 2, 3), order="F"), h * h + x[:, 1] ** 2
-    J[:, 0, 0], J[:, 0, 2] = x[:, 2] / h**2, -x[:, 0] / h**2
-    J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = -x[:, 0] * x[:, 1] / (h * n2), h / n2, -x[:, 2] * x[:, 1] / (h * n2)
-    return m, valid, J
 
 
 def _direction(m: Array) -> tuple[Array, np.ndarray]:

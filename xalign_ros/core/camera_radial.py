@@ -1,14 +1,18 @@
-"""Lenses along the radius: q(r, z), the distorted radius of a ray r from the axis and z along it, and its inverse.
+"""Lenses along the radius: the inverse of q(r, z), the distorted radius of a ray r from the axis and z along it.
 
-Formulas and sources: core/camera.py. Each returns q and its derivatives with respect to r and z, all (N,).
+Formulas and sources: core/camera.py; q itself is in src/camera.hpp.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from xalign_ros.core import kernels
+from xalign_ros.core.camera_plane import padded
 from xalign_ros.core.lie import Array
 
+# As src/camera.hpp numbers them; "" is a pinhole, and the last one is no lens but a sphere.
+LENSES = ("", "equidistant", "fov", "eucm", "double_sphere", "division", "cubic", "mirror", "equirectangular")
 MAX_ANGLE_RAD = np.deg2rad(170.0)  # of a fisheye ray from the axis; nothing real sees further
 
 
@@ -16,9 +20,8 @@ def monotonic_limit(lens: str, D: Array) -> float:
     """Angle (rad) from the axis up to which q rises."""
     x = np.linspace(0, MAX_ANGLE_RAD, 2000)
     for _ in range(3):  # coarse, then within one step of it
-        with np.errstate(all="ignore"):
-            q, q_r, q_z = RADIAL[lens](D, np.sin(x), np.cos(x))
-            bad = np.flatnonzero(~((q_r * np.cos(x) - q_z * np.sin(x) > 0) & (q >= 0)))
+        q, q_r, q_z = kernels.radius(LENSES.index(lens), padded(D, 6), np.sin(x), np.cos(x))
+        bad = np.flatnonzero(~((q_r * np.cos(x) - q_z * np.sin(x) > 0) & (q >= 0)))
         if not len(bad) or bad[0] == 0:
             return 0.0 if len(bad) else float(x[-1])
         x = np.linspace(x[bad[0] - 1], x[bad[0]], 50)
@@ -62,61 +65,6 @@ def _powers(D: Array) -> tuple[Array, Array]:
     return poly, poly * np.arange(2 * len(D) + 1, 0, -2)
 
 
-def _equidistant(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
-    angle, n2 = np.arctan2(r, z), r * r + z * z
-    poly, powers = _powers(D)
-    slope = np.polyval(powers, angle**2)
-    return angle * np.polyval(poly, angle**2), slope * z / n2, -slope * r / n2
-
-
-def _fov(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
-    c = 2 * np.tan(D[0] / 2)
-    g = c / D[0] / (c * c * r * r + z * z)
-    return np.arctan2(c * r, z) / D[0], g * z, -g * r
-
-
-def _eucm(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
-    alpha, beta = D
-    d = np.sqrt(beta * r * r + z * z)
-    w, w_r, w_z = alpha * d + (1 - alpha) * z, alpha * beta * r / d, alpha * z / d + 1 - alpha
-    return r / w, 1 / w - r * w_r / w**2, -r * w_z / w**2
-
-
-def _double_sphere(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
-    xi, alpha = D
-    d1 = np.hypot(r, z)
-    e, e_r, e_z = xi * d1 + z, xi * r / d1, xi * z / d1 + 1
-    d2 = np.hypot(r, e)
-    w = alpha * d2 + (1 - alpha) * e
-    w_r, w_z = alpha * (r + e * e_r) / d2 + (1 - alpha) * e_r, alpha * e * e_z / d2 + (1 - alpha) * e_z
-    return r / w, 1 / w - r * w_r / w**2, -r * w_z / w**2
-
-
-def _division(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
-    root = np.sqrt(z * z - 4 * D[0] * r * r)
-    w = (z + root) / 2
-    return r / w, 1 / w + 2 * D[0] * r * r / (root * w**2), -r * (1 + z / root) / (2 * w**2)
-
-
-def _cubic(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
-    z = np.where(z > 0, z, np.nan)  # rays from behind have no pixel
-    u, c = r / z, np.sqrt(3 * np.abs(D[0]))
-    # The root of q + k q^3 = u that grows from zero.
-    q = (
-        u
-        if c == 0
-        else 2 / c * (np.sinh(np.arcsinh(1.5 * c * u) / 3) if D[0] > 0 else np.sin(np.arcsin(1.5 * c * u) / 3))
-    )
-    slope = 1 / (1 + 3 * D[0] * q * q)
-    return q, slope / z, -slope * u / z
-
-
-def _mirror(D: Array, r: Array, z: Array) -> tuple[Array, Array, Array]:
-    n = np.hypot(r, z)
-    w = z + D[0] * n
-    return r / w, 1 / w - D[0] * r * r / (n * w**2), -r * (1 + D[0] * z / n) / w**2
-
-
 # The ray (r, z) of a distorted radius, up to its length.
 
 
@@ -148,15 +96,6 @@ def _mirror_ray(D: Array, q: Array) -> tuple[Array, Array]:
     return k * q, k - D[0]
 
 
-RADIAL = {
-    "equidistant": _equidistant,
-    "fov": _fov,
-    "eucm": _eucm,
-    "double_sphere": _double_sphere,
-    "division": _division,
-    "cubic": _cubic,
-    "mirror": _mirror,
-}
 _RAY = {
     "eucm": _eucm_ray,
     "double_sphere": _double_sphere_ray,

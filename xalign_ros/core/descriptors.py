@@ -8,7 +8,6 @@ from xalign_ros.core.lie import Array
 from xalign_ros.core.records import Norm
 
 CACHED = 1 << 16  # distances computed at a time
-DENSE = 0.02  # part of all pairs beyond which computing them all is the faster way
 
 
 def pair_distance(a: np.ndarray, b: np.ndarray, norm: Norm) -> Array:
@@ -20,19 +19,6 @@ def pair_distance(a: np.ndarray, b: np.ndarray, norm: Norm) -> Array:
         scale = np.linalg.norm(x, axis=1) * np.linalg.norm(y, axis=1)
         return np.asarray(1 - np.einsum("ij,ij->i", x, y) / np.maximum(scale, 1e-12), float)
     return np.asarray(np.linalg.norm(x - y, axis=1), float)
-
-
-def indexed_distance(a: np.ndarray, b: np.ndarray, i: np.ndarray, j: np.ndarray, norm: Norm) -> Array:
-    """Distances (P,) of rows i (P,) of a (N, B) to rows j (P,) of b (M, B)."""
-    if norm is Norm.HAMMING:
-        return differing_bits(columns(a), columns(b), i, j).astype(float)
-    if len(i) < DENSE * len(a) * len(b):
-        return pair_distance(a[i], b[j], norm)
-    if norm is Norm.COSINE_FLOAT32:
-        return np.asarray(1 - (unit(a) @ unit(b).T)[i, j], float)
-    x, y = a.astype(np.float32), b.astype(np.float32)
-    squared = np.einsum("ij,ij->i", x, x)[i] + np.einsum("ij,ij->i", y, y)[j] - 2 * (x @ y.T)[i, j]
-    return np.asarray(np.sqrt(np.maximum(squared, 0)), float)
 
 
 def columns(codes: np.ndarray) -> np.ndarray:

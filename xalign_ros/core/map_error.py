@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from xalign_ros.core import kernels
 from xalign_ros.core.camera import Camera
-from xalign_ros.core.lie import EYE3, Array, hat, turn_and_shift
+from xalign_ros.core.lie import Array
 from xalign_ros.core.pnp import Points2D3D
 from xalign_ros.core.transforms import SE3
 
@@ -39,17 +40,8 @@ def telling(inlier: np.ndarray) -> np.ndarray:
 
 def pose_influence(T_map_cam: SE3, m: Points2D3D, camera: Camera) -> Array:
     """By how much (P, 6, 3) the least squares pose of P matches moves, its tangent on the right, with each point (m)."""
-    x_cam = (T_map_cam.R.T @ (m.xyz - T_map_cam.t).T).T
-    _, valid, J_cam = camera.project_with_jacobian(x_cam)
-    J_cam[~valid] = 0.0
-    J_map = (T_map_cam.R @ J_cam.T.reshape(3, -1)).reshape(3, 2, -1)
-    cov = np.ascontiguousarray(np.moveaxis(m.cov, 0, -1))
-    spread = sum(((cov * row).sum(axis=1) * row).sum(axis=0) for row in J_map.swapaxes(0, 1))
-    J = turn_and_shift(J_cam, x_cam)
-    Jw = J / (m.sigma_px**2 + spread / 2)
-    H = Jw.reshape(6, -1) @ J.reshape(6, -1).T
-    moved = Jw[:, None, 0] * J_map[:, 0] + Jw[:, None, 1] * J_map[:, 1]
-    return np.moveaxis(-np.linalg.solve(H, moved.reshape(6, -1)).reshape(moved.shape), -1, 0)
+    T = T_map_cam
+    return kernels.pose_influence(camera.numbers, T.R, T.t, m.uv, m.sigma_px, m.xyz, m.cov)
 
 
 def shared_covariance(influence: Array, xyz: Array, cov: Array, sources: Sources) -> tuple[Array, Array]:
@@ -58,21 +50,8 @@ def shared_covariance(influence: Array, xyz: Array, cov: Array, sources: Sources
     influence (P, D, 3) is the estimate's by points xyz (P, 3), whose cov (P, 3, 3) is the inverse normal matrix of their
     triangulation: where a ray moves by d across itself at the point, the point moves by cov (I - u u^T) d / (range sigma)^2.
     """
-    keyframes, keyframe = np.unique(sources.keyframe, return_inverse=True)
-    x = xyz[sources.point] - sources.centre
-    range2 = np.einsum("oi,oi->o", x, x)
-    # What each observation moves its point's normal equations by: hat(x) (which takes out what is along x), I - u u^T.
-    moves = np.empty((len(x), 3, 6))
-    moves[:, :, :3] = hat(x)
-    moves[:, :, 3:] = EYE3 - x[:, :, None] * (x / range2[:, None])[:, None]
-    moves /= (range2 * sources.sigma_rad**2)[:, None, None]
-    row = 3 * sources.point[:, None] + np.arange(3)
-    at = 6 * (row * len(keyframes) + keyframe[:, None])[:, :, None] + np.arange(6)
-    by_point = np.bincount(at.ravel(), moves.ravel(), minlength=len(xyz) * len(keyframes) * 18)
-    D = (influence @ cov).swapaxes(0, 1).reshape(influence.shape[1], -1)
-    G = (D @ by_point.reshape(3 * len(xyz), -1)).reshape(len(D), -1, 2, 3)  # of each keyframe: by its turn, its shift
-    rotation, position = (part @ part.T for part in np.moveaxis(G, 2, 0).reshape(2, len(D), -1))
-    return rotation, position
+    o = sources
+    return kernels.shared_covariance(influence, xyz, cov, o.point, o.keyframe, o.centre, o.sigma_rad)
 
 
 def held_out_sigmas(

@@ -12,19 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 import poselib
 
+from xalign_ros.core import kernels
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.config import Pnp
-from xalign_ros.core.lie import Array, so3_exp, turn_and_shift
+from xalign_ros.core.lie import Array
 from xalign_ros.core.transforms import SE3
 
 MAX_RAY_RAD = np.deg2rad(80.0)  # of a virtual pinhole
 CLEAR_MAJORITY, CLEAR_INLIERS = 0.9, 60  # part of the matches, and their number
-SWEEPS = 10  # at most
-FAR = 5.0  # times the inlier threshold; no sweep brings such a match back
 TUKEY = 1.5  # times the inlier threshold, beyond which a match has no weight
-WIDE = 3.0  # scale of the first sweep: from below, a scale and its inliers may hold each other down
 LEAST_SCALE = 0.3  # of the residuals' scale over what the features say of themselves
-CONVERGED = 0.2  # length of a step in standard deviations of the pose: the next would be an eighth of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,43 +99,28 @@ def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> P
     for that, as one that is cut off does. `few` is their correction for few residuals, which count by their weights, and
     what an estimated scale adds to the mean NEES.
     """
-    flat, scale, count = TUKEY * config.threshold_sigmas, WIDE, len(m.uv)
-    r, J, size, error_px, W = _residuals(T_map_cam, m, camera, None)
-    near = np.flatnonzero(size < FAR * config.threshold_sigmas)
-    m, W = m.take(near), W[:, near]
-    r, J, size, error_px = r[:, near], J[:, :, near], size[near], error_px[near]
-    for sweep in range(SWEEPS):
-        used = size < flat * scale
-        if np.count_nonzero(used) < config.min_inliers:
-            return "too_few_inliers"
-        scale = max(upper_median(size[used]) / 1.1774, LEAST_SCALE)
-        u2 = (size / scale) ** 2
-        part = np.where(used, np.maximum(1 - u2 / flat**2, 0), 0)
-        weight = part**2
-        rows, weighted = J.reshape(6, -1), (J * weight).reshape(6, -1)
-        H, g = weighted @ rows.T, weighted @ r.ravel()
-        step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -g)
-        depth = upper_median((T_map_cam.R[:, 2] @ (m.xyz - T_map_cam.t).T)[used])
-        if step[3:] @ step[3:] > (config.max_sigma_ratio * depth) ** 2:
-            return "degenerate"
-        T_map_cam = T_map_cam @ SE3(so3_exp(step[:3]), step[3:])
-        if sweep and -step @ g < (CONVERGED * scale) ** 2:
-            r = r + (step @ rows).reshape(r.shape)  # so small a step is linear
-            size = np.hypot(r[0], r[1])
-            break
-        r, J, size, error_px, W = _residuals(T_map_cam, m, camera, W)
-    inlier = np.flatnonzero(size < config.threshold_sigmas * scale)
-    if len(inlier) < config.min_inliers:
-        return "too_few_inliers"
-    rows = J[:, :, used].reshape(6, -1)
-    H = rows @ rows.T
+    flat, T = TUKEY * config.threshold_sigmas, T_map_cam
+    reason, R, t, H, scale, depth, moments, size, error_px, sharp = kernels.refine_pose(
+        camera.numbers,
+        T.R,
+        T.t,
+        m.uv,
+        m.sigma_px,
+        m.xyz,
+        m.cov,
+        config.threshold_sigmas,
+        flat,
+        config.min_inliers,
+        config.max_sigma_ratio,
+    )
+    inlier = size < config.threshold_sigmas * scale
+    if reason or inlier.sum() < config.min_inliers:
+        return reason or "too_few_inliers"
     eigen = np.linalg.eigvalsh(H)
     if eigen[0] <= 1e-12 * eigen[-1]:
         return "degenerate"
-    weight, part, u2 = weight[used], part[used], u2[used]
-    A, curvature = float((weight**2 * u2).mean()) / 2, weight - 2 * part * u2 / flat**2
-    B, numbers = float(curvature.mean()), 2 * float(weight.sum())
-    few = numbers / (numbers - 8) * (1 + 6 / numbers * float(curvature.var()) / B**2) ** 2
+    A, B, variance, numbers = moments
+    few = numbers / (numbers - 8) * (1 + 6 / numbers * variance / B**2) ** 2
     spread = A / B**2 if scale > LEAST_SCALE else max(A / B**2, 1.0)
     cov = np.linalg.inv(H) * scale**2 * spread * few * config.inflation
     rms_sigmas = float(np.sqrt((size[inlier] ** 2).mean() / 2))
@@ -146,12 +128,11 @@ def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> P
         return "high_residual"
     if np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]) > config.max_sigma_ratio * depth:
         return "degenerate"
-    sharp = m.sigma_px**2 * W[0] * W[2]
-    if evidence(m.uv[size < 2], camera, sharp[size < 2]) < config.min_spread:
+    near = size < 2
+    if evidence(m.uv[near], camera, sharp[near]) < config.min_spread:
         return "degenerate" if evidence(m.uv[inlier], camera) < config.min_spread else "high_residual"
-    is_inlier = np.zeros(count, bool)
-    is_inlier[near[inlier]] = True
-    return Pose(T_map_cam, (cov + cov.T) / 2, is_inlier, float(np.sqrt((error_px[inlier] ** 2).mean())), rms_sigmas)
+    rms_px = float(np.sqrt((error_px[inlier] ** 2).mean()))
+    return Pose(SE3(R, t), (cov + cov.T) / 2, inlier, rms_px, rms_sigmas)
 
 
 def evidence(uv: Array, camera: Camera, sharp: Array | None = None) -> float:
@@ -173,36 +154,3 @@ def evidence(uv: Array, camera: Camera, sharp: Array | None = None) -> float:
 def upper_median(x: Array) -> float:
     """The upper one of two, in a fifth of the time that NumPy's takes."""
     return float(np.partition(x, len(x) // 2)[len(x) // 2])
-
-
-def _residuals(T: SE3, m: Points2D3D, camera: Camera, W: Array | None) -> tuple[Array, Array, Array, Array, Array]:
-    """Residuals (2, N) and their rows of the Jacobian (6, 2, N) in sigmas, Mahalanobis length (N,), pixel error (N,), W.
-
-    W (3, N) is the lower triangle L^-1, row by row, of each residual's covariance L L^T, taken here where there is none.
-    Invalid residuals: infinite.
-    """
-    x_cam = (T.R.T @ (m.xyz - T.t).T).T
-    uv, valid, J_cam = camera.project_with_jacobian(x_cam)
-    r = (uv - m.uv).T
-    if not valid.all():
-        r[:, ~valid], J_cam[~valid] = 0.0, 0.0
-    error_px = np.hypot(r[0], r[1])
-    if W is None:
-        W = _whitening((T.R @ J_cam.T.reshape(3, -1)).reshape(3, 2, -1), m)
-    for rows in (J_cam.T, r[None]):
-        rows[:, 1] *= W[2]
-        rows[:, 1] += W[1] * rows[:, 0]
-        rows[:, 0] *= W[0]
-    size = np.hypot(r[0], r[1])
-    size[~valid] = np.inf
-    return r, turn_and_shift(J_cam, x_cam), size, error_px, W
-
-
-def _whitening(J: Array, m: Points2D3D) -> Array:
-    """A 2 x 2 Cholesky factor inverted by hand; J (3, 2, N) is that of the pixels by the map point."""
-    cov, (u, v) = np.ascontiguousarray(np.moveaxis(m.cov, 0, -1)), np.swapaxes(J, 0, 1)
-    cov_u, cov_v, own = (cov * u).sum(axis=1), (cov * v).sum(axis=1), m.sigma_px**2
-    a = np.sqrt((cov_u * u).sum(axis=0) + own)
-    b = (cov_u * v).sum(axis=0) / a
-    c = np.sqrt(np.maximum((cov_v * v).sum(axis=0) + own - b * b, 1e-12))
-    return np.array([1 / a, -b / (a * c), 1 / c])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from xalign_ros.core import kernels
 from xalign_ros.core.camera import Camera
 from xalign_ros.core.lie import Array
 from xalign_ros.core.map_error import Sources
@@ -16,7 +17,6 @@ from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.core.vocabulary import Vocabulary, slices
 
 LEAST_VIEW_COSINE = 0.5  # to the mean direction a point was seen from (ORB-SLAM, Mur-Artal et al. 2015, section V-D)
-MASK_COST = 20  # entries of a mask over all points that take the time of sorting one point
 MOST_ZOOM = 2.0  # times nearer or farther than a point was seen from
 
 
@@ -160,26 +160,14 @@ class MapIndex:
 
     def points_of(self, keyframes: np.ndarray) -> np.ndarray:
         """Sorted indices of the points seen by any of these map keyframes."""
-        v = self.visibility
-        parts = [v.keyframe_point[v.keyframe_offset[k] : v.keyframe_offset[k + 1]] for k in keyframes]
-        points = np.concatenate(parts) if parts else np.zeros(0, np.int64)
-        if len(points) * MASK_COST < len(self.map.points):
-            return np.unique(points).astype(np.int64)
-        seen = np.zeros(len(self.map.points), bool)
-        seen[points] = True
-        return np.flatnonzero(seen)
+        offset = self.visibility.keyframe_offset
+        first, last = offset[keyframes], offset[np.add(keyframes, 1)]
+        return kernels.points_of(self.visibility.keyframe_point, first, last, len(self.map.points))
 
     def visible_points(self, T_map_cam: SE3, keyframes: np.ndarray) -> np.ndarray:
         """Points that any of these map keyframes sees and this camera might: from about that side, about as far away."""
-        points = self.points_of(keyframes)
-        ray = T_map_cam.t - self.map.points[points]
-        distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
-        cosine = np.einsum("ij,ij->i", ray, self.visibility.view[points])
-        least, most = self.visibility.distances[points].T
-        same = cosine > LEAST_VIEW_COSINE * distance
-        same &= MOST_ZOOM * distance > least
-        same &= distance < MOST_ZOOM * most
-        return np.asarray(points[same])
+        v, points = self.visibility, self.points_of(keyframes)
+        return kernels.visible(points, self.map.points, v.view, v.distances, T_map_cam.t, LEAST_VIEW_COSINE, MOST_ZOOM)
 
     def keyframes_near(self, T_map_cam: SE3, count: int) -> np.ndarray:
         """Map keyframes whose view is most like this pose's, nearest first: distance over scene depth plus chord of the angle."""
