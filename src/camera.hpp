@@ -39,6 +39,22 @@ struct Plane {
     J[2] = both + slope_v * x;
     J[3] = g + bend * y * y + 3 * yp + xp + slope_v * y;
   }
+
+  // Newton's method from `a` (2) towards what goes to m (2): whole steps, which converge in 3-6 well inside the fold, or
+  // small ones first that never leave the disc of radius `limit`.
+  void newton(const double m[2], double a[2], double limit, bool small) const {
+    constexpr int WHOLE = 20, SMALL = 40, LAST = 10;
+    for (int n = 0; n < (small ? SMALL + LAST : WHOLE); ++n) {
+      double f[2], J[4];
+      distort(a[0], a[1], f, J);
+      const double r[2] = {f[0] - m[0], f[1] - m[1]}, part = (small && n < SMALL ? 0.3 : 1.0) / (J[0] * J[3] - J[1] * J[2]);
+      a[0] -= part * (J[3] * r[0] - J[1] * r[1]);
+      a[1] -= part * (J[0] * r[1] - J[2] * r[0]);
+      if (std::abs(r[0]) <= 1e-13 && std::abs(r[1]) <= 1e-13) return;
+      const double radius = std::hypot(a[0], a[1]);
+      if (small && radius > limit) a[0] *= limit / radius, a[1] *= limit / radius;
+    }
+  }
 };
 
 enum Lens { PINHOLE, EQUIDISTANT, FOV, EUCM, DOUBLE_SPHERE, DIVISION, CUBIC, MIRROR, EQUIRECTANGULAR };

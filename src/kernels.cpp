@@ -98,6 +98,17 @@ py::tuple distort(const Rows<double> &numbers, const py::array_t<double, py::arr
   return py::make_tuple(f, J);
 }
 
+py::array_t<double> undistort(const Rows<double> &numbers, const Rows<double> &points, const Rows<double> &start,
+                              double limit, bool small) {
+  expect(numbers, "numbers", {sizeof(xalign::Plane) / sizeof(double)}), expect(points, "points", {-1, 2});
+  expect(start, "start", {points.shape(0), 2});
+  const auto &plane = *reinterpret_cast<const xalign::Plane *>(numbers.data());
+  py::array_t<double> found = matrix_of(points.shape(0), 2, start.data());
+  for (py::ssize_t n = 0; n < points.shape(0); ++n)
+    plane.newton(points.data() + 2 * n, found.mutable_data() + 2 * n, limit, small);
+  return found;
+}
+
 py::array_t<double> radius(int lens, const Rows<double> &D, const Rows<double> &r, const Rows<double> &z) {
   expect(D, "D", {6}), expect(r, "r", {-1}), expect(z, "z", {r.shape(0)});
   py::array_t<double> q({py::ssize_t(3), r.shape(0)});
@@ -287,6 +298,8 @@ PYBIND11_MODULE(kernels, m) {
   const auto table = [](const char *name) { return py::arg(name).noconvert(); };
   m.def("project", &project, py::arg("numbers"), py::arg("xyz"));
   m.def("distort", &distort, py::arg("numbers"), py::arg("points"));
+  m.def("undistort", &undistort, py::arg("numbers"), py::arg("points"), py::arg("start"), py::arg("limit"),
+        py::arg("small"));
   m.def("radius", &radius, py::arg("lens"), py::arg("D"), py::arg("r"), py::arg("z"));
   m.def("points_of", &points_of, table("seen"), py::arg("first"), py::arg("last"), py::arg("points"));
   m.def("visible", &visible, py::arg("rows"), table("points"), table("view"), table("distances"), py::arg("eye"),

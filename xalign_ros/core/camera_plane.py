@@ -42,33 +42,16 @@ class PlaneDistortion:
         with np.errstate(all="ignore"):
             if self.tilt is not None:
                 m = _through(np.asarray(np.linalg.inv(self.tilt), float), m)
-            a = self._newton(m, m, np.inf, (1.0,) * 20)
+            a = kernels.undistort(self.numbers, m, m, self.limit, False)
             valid = self._solved(m, a)
             again = np.flatnonzero(~valid & np.isfinite(m).all(axis=1))
             if len(again):  # from where the radial part alone would have it, in small steps, never out of the disc
                 r, r_m = np.geomspace(1e-3, self.limit, 400), np.hypot(*m[again].T)
                 near = np.interp(r_m, r * _series(self.top, r * r) / _series(self.low, r * r), r)
                 start = m[again] * (near / r_m)[:, None]
-                a[again] = self._newton(m[again], start, self.limit, (0.3,) * 40 + (1.0,) * 10)
+                a[again] = kernels.undistort(self.numbers, m[again], start, self.limit, True)
                 valid[again] = self._solved(m[again], a[again])
         return a, valid
-
-    def _newton(self, m: Array, start: Array, limit: float, parts: tuple[float, ...]) -> Array:
-        """Newton's method on 2 x 2 systems, of each step a part; whole ones converge in 3-6 well inside the fold."""
-        a = start.copy()
-        for part in parts:
-            f, J = kernels.distort(self.numbers, a)
-            r = f - m
-            det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-            step = np.stack(
-                [J[:, 1, 1] * r[:, 0] - J[:, 0, 1] * r[:, 1], J[:, 0, 0] * r[:, 1] - J[:, 1, 0] * r[:, 0]], axis=1
-            )
-            a -= part * step / det[:, None]
-            if not (np.abs(r) > 1e-13).any():
-                break
-            if limit < np.inf:
-                a *= np.minimum(1, limit / np.maximum(np.hypot(a[:, 0], a[:, 1]), 1e-12))[:, None]
-        return a
 
     def _solved(self, m: Array, a: Array) -> np.ndarray:
         near = (np.abs(kernels.distort(self.numbers, a)[0] - m) < 1e-12 * (1 + np.abs(m))).all(axis=1)

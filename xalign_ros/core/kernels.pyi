@@ -19,6 +19,9 @@ def project(numbers: Array, xyz: Array) -> tuple[Array, np.ndarray, Array]:
 def distort(numbers: Array, points: Array) -> tuple[Array, Array]:
     """Distorted points (N, 2) of PlaneDistortion.numbers (13,), but for the tilt, and their Jacobian (N, 2, 2)."""
 
+def undistort(numbers: Array, points: Array, start: Array, limit: float, small: bool) -> Array:
+    """Newton's method from start (N, 2) towards what goes to points (N, 2); in small steps within a disc, or in whole ones."""
+
 def radius(lens: int, D: Array, r: Array, z: Array) -> Array:
     """Rows (3, N): distorted radius q of rays r from the axis and z along it, dq/dr, dq/dz; D (6,)."""
 

@@ -114,7 +114,8 @@ def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> P
         config.max_sigma_ratio,
     )
     inlier = size < config.threshold_sigmas * scale
-    if reason or inlier.sum() < config.min_inliers:
+    count = np.count_nonzero(inlier)
+    if reason or count < config.min_inliers:
         return reason or "too_few_inliers"
     eigen = np.linalg.eigvalsh(H)
     if eigen[0] <= 1e-12 * eigen[-1]:
@@ -123,16 +124,17 @@ def refine_pose(T_map_cam: SE3, m: Points2D3D, camera: Camera, config: Pnp) -> P
     few = numbers / (numbers - 8) * (1 + 6 / numbers * variance / B**2) ** 2
     spread = A / B**2 if scale > LEAST_SCALE else max(A / B**2, 1.0)
     cov = np.linalg.inv(H) * scale**2 * spread * few * config.inflation
-    rms_sigmas = float(np.sqrt((size[inlier] ** 2).mean() / 2))
+    sigmas, px = size[inlier], error_px[inlier]
+    rms_sigmas = math.sqrt(sigmas @ sigmas / count / 2)
     if rms_sigmas > config.max_rms_sigmas:
         return "high_residual"
-    if np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]) > config.max_sigma_ratio * depth:
+    most = (config.max_sigma_ratio * depth) ** 2
+    if cov[3:, 3:].trace() > most and np.linalg.eigvalsh(cov[3:, 3:])[-1] > most:
         return "degenerate"
     near = size < 2
     if evidence(m.uv[near], camera, sharp[near]) < config.min_spread:
         return "degenerate" if evidence(m.uv[inlier], camera) < config.min_spread else "high_residual"
-    rms_px = float(np.sqrt((error_px[inlier] ** 2).mean()))
-    return Pose(SE3(R, t), (cov + cov.T) / 2, inlier, rms_px, rms_sigmas)
+    return Pose(SE3(R, t), (cov + cov.T) / 2, inlier, math.sqrt(px @ px / count), rms_sigmas)
 
 
 def evidence(uv: Array, camera: Camera, sharp: Array | None = None) -> float:
@@ -145,7 +147,8 @@ def evidence(uv: Array, camera: Camera, sharp: Array | None = None) -> float:
     number = len(uv) if sharp is None else float(sharp.sum())
     if len(uv) < 3:
         return 0.0
-    du, dv = (uv - uv.mean(axis=0)).T
+    u, v = uv.T
+    du, dv = u - u.sum() / len(uv), v - v.sum() / len(uv)
     determinant = float((du @ du) * (dv @ dv) - (du @ dv) ** 2)
     area = 12 * math.sqrt(max(determinant, 0.0)) / (len(uv) - 1)
     return number * area / (camera.width * camera.height)
