@@ -42,8 +42,9 @@ $(STAMP):
 	@'$(PYTHON)' -m venv $(VENV)
 	@$(PY) -m pip install -q --disable-pip-version-check uv==0.13.8
 	@echo 'setup: ROS 2 and solver wheels (about 1.1 GB installed), compiling messages and kernels; a minute on a good line'
-	@# reinstall: uv would take the messages of an earlier build from its cache. pip: knows mirrors that uv does not.
-	@$(VENV)/bin/uv pip install -q --python $(PY) --reinstall-package xalign-msgs ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,batch,test]' \
+	@# compile: half of a command's start, where Python may not write bytecode. reinstall: uv would take the messages of an
+	@# earlier build from its cache. pip: knows mirrors that uv does not.
+	@$(VENV)/bin/uv pip install -q --python $(PY) --compile-bytecode --reinstall-package xalign-msgs ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,batch,test]' \
 	  || { echo 'setup: once more with pip' >&2; $(PY) -m pip install -q -U pip \
 	       && $(PY) -m pip install -q ./msg_defs/tf2_msgs ./msg_defs -e '.[wheels,algo,batch,test]'; }
 	@rm -f $(VENV)/.done-*

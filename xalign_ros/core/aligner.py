@@ -106,9 +106,9 @@ class Aligner:
     def _find_anchor(self, keyframe: Keyframe, predicted: Prediction | None) -> Anchor | Rejection:
         """Guided around the prediction while there is one; over the whole map when not, or when coasting in vain."""
         if predicted is not None:
-            S, cov = predicted
-            found = find_guided(keyframe, self.index, S.rigid_pose(), pose_covariance(S, cov), self.config)
-            state = self.belief.judged(pose_covariance(S, cov))[0]
+            T, cov = predicted[0].rigid_pose(), pose_covariance(*predicted)
+            found = find_guided(keyframe, self.index, T, cov, self.config)
+            state = self.belief.judged(cov)[0]
             if isinstance(found, Anchor) or (state is State.LOCALIZED and not self.belief.challenged):
                 self._sightings.clear()
                 return found

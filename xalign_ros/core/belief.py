@@ -183,11 +183,11 @@ class Belief:
         if isinstance(found, Rejection):
             return found
         self._links[-1].anchor = found
-        if predicted is None or self.judged(pose_covariance(*predicted))[0] is State.LOST:
+        cov = None if predicted is None else pose_covariance(*predicted)
+        if predicted is None or cov is None or self.judged(cov)[0] is State.LOST:
             return refused(found, "inconsistent", WAITS)
-        S, cov = predicted
-        error = (found.T_map_cam.inverse() @ S.rigid_pose()).log()
-        chi2 = float(error @ np.linalg.solve(pose_covariance(S, cov) + found.cov_cam, error))
+        error = (found.T_map_cam.inverse() @ predicted[0].rigid_pose()).log()
+        chi2 = float(error @ np.linalg.solve(cov + found.cov_cam, error))
         if chi2 < self.config.lock.chi2:
             return found
         off = float(np.linalg.norm(error[3:]))

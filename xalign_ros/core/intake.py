@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from operator import mul
 
 import numpy as np
 
@@ -62,9 +64,11 @@ def _fault(k: Keyframe, earlier: Sequence[Keyframe], map_: ReferenceMap) -> tupl
 
 
 def _pose_fault(T: SE3) -> str:
-    if not (np.isfinite(T.R).all() and np.isfinite(T.t).all()):
+    x, y, z = rows = T.R.tolist()
+    if not all(map(math.isfinite, [*x, *y, *z, *T.t.tolist()])):
         return "the odometry pose is not finite"
-    if np.abs(T.R @ T.R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(T.R) < 0:
+    off = max(abs(sum(map(mul, a, b)) - (a is b)) for a in rows for b in rows)
+    if off > ROTATION_TOLERANCE or np.linalg.det(T.R) < 0:
         return "the odometry pose is not a rotation and a translation"
     return ""
 

@@ -76,7 +76,7 @@ def sample_pose(m: Points2D3D, camera: Camera, seed: int, config: Pnp) -> SE3 | 
         m.xyz[usable],
         {"model": "PINHOLE", "width": size, "height": size, "params": [focal, focal, 0.0, 0.0]},
         {
-            "max_reproj_error": TUKEY * config.threshold_sigmas * float(np.median(m.sigma_px)),
+            "max_reproj_error": TUKEY * config.threshold_sigmas * upper_median(m.sigma_px),
             "seed": seed,
             "max_iterations": config.iterations,
             "min_iterations": 50,

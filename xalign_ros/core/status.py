@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
+
 from scipy.special import gammainc
 
 from xalign_ros.core.config import Status
@@ -12,7 +13,7 @@ from xalign_ros.core.records import State
 
 def position_sigma(cov_cam: Array) -> float:
     """Root mean square position error (m) that a pose covariance (6, 6) predicts."""
-    return float(np.sqrt(np.trace(cov_cam[3:, 3:])))
+    return math.sqrt(cov_cam[3:, 3:].trace())
 
 
 def score(cov_cam: Array, bound_m: float) -> float:
@@ -22,7 +23,7 @@ def score(cov_cam: Array, bound_m: float) -> float:
     variance (Satterthwaite 1946, Welch 1947).
     """
     C = cov_cam[3:, 3:]
-    mean, variance = np.trace(C), 2 * np.trace(C @ C)
+    mean, variance = C.trace(), 2 * (C * C).sum()
     return float(gammainc(mean**2 / variance, bound_m**2 * mean / variance))
 
 
