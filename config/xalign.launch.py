@@ -53,7 +53,7 @@ def generate_launch_description():
                 description="parameter file (YAML)",
             ),
             DeclareLaunchArgument("map", default_value="", description="folder NAME.xmap; wins over params_file"),
-            DeclareLaunchArgument("source", default_value="", description="keyframes, odometry, vins or openvins"),
+            DeclareLaunchArgument("source", default_value="", description="keyframes, odometry, tf, vins or openvins"),
             DeclareLaunchArgument("rviz", default_value="false", description="show it in RViz"),
             DeclareLaunchArgument("use_sim_time", default_value="false", description="follow /clock"),
             OpaqueFunction(function=aligner),

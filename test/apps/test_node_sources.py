@@ -8,7 +8,7 @@ from live_world import LiveWorld
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from xalign_ros.io import ros_fields as ros
-from xalign_ros.io.adapter import IMAGES, KINDS
+from xalign_ros.io.adapter import IMAGES, KINDS, PLAIN
 from xalign_ros.io.frame_messages import TF
 from xalign_ros.io.image_message import IMAGE
 from xalign_ros.io.log import typestore
@@ -16,7 +16,7 @@ from xalign_ros.io.ros_fields import ros_types
 from xalign_ros.io.step_messages import TOPICS
 from xalign_ros.io.xmap import write_map
 
-RELIABLE = {"vins": ("pose", "points", "extrinsic"), "openvins": ("pose", "points", "extrinsic"), "odometry": ()}
+RELIABLE = ("pose", "points", "extrinsic", "moving")  # but for a plain odometry's poses
 TRUTH = {sources.T0 + n * sources.IMAGE_MS * sources.MS: sources.T_map_cam(n * sources.IMAGE_MS) for n in range(25)}
 
 
@@ -29,7 +29,7 @@ def painted(tmp_path_factory):
 
 def role_of(kind, topic, type_):
     if type_ == TF:
-        return "static", "/tf_static"
+        return ("static" if topic == "/tf_static" else "moving"), topic
     for role, (name, of_type) in (KINDS[kind] | IMAGES).items():
         if type_ == of_type and (role in IMAGES or role != "pose" or "extrinsic" not in topic):
             if role in ("pose", "extrinsic") and kind != "odometry" and topic.rpartition("/")[2] != name:
@@ -45,7 +45,7 @@ def play(me, kind, entries):
     for _, topic, type_, _ in entries:
         role, name = role_of(kind, topic, type_)
         if name not in out:
-            reliable = role in RELIABLE[kind]
+            reliable = role in RELIABLE and kind != "odometry"
             if role == "static":
                 latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
                 out[name] = me.node.create_publisher(ros_types(TF), name, latched)
@@ -59,7 +59,7 @@ def play(me, kind, entries):
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_a_source_with_images_is_localized(kind, painted, tmp_path):
-    arguments = ["-p", f"source:={kind}", *(("-p", "metric_scale:=true") if kind == "odometry" else ())]
+    arguments = ["-p", f"source:={kind}", *(("-p", "metric_scale:=true") if kind in PLAIN else ())]
     topics = {"correction": TOPICS["correction"], "state": TOPICS["state"]}
     with live.node(tmp_path, painted, *arguments) as node, live.observer(**topics) as me:
         assert me.hears()

@@ -20,6 +20,7 @@ from source_messages import (
     odometry_entries,
     odometry_log_entries,
     painted_map,
+    tf_log_entries,
     vins_entries,
     write_source_log,
 )
@@ -153,6 +154,13 @@ REFUSED = {
         "--base-from-cam must be x y z qx qy qz qw with |q| = 1",
     ),
     "without a source": (odometry_log_entries, ["--source", "keyframes", "--features", "orb"], "give --source"),
+    "another frame": (
+        tf_log_entries,
+        ["--source", "tf", "--odom-frame", "world"],
+        "/tf has no transform out of 'world'; it has map -> odom, odom -> base, base -> arm: name the frame by odom_frame",
+    ),
+    "a frame for an odometry": (odometry_log_entries, ["--odom-frame", "odom"], "--odom-frame is for --source tf"),
+    "no tf": (odometry_log_entries, ["--source", "tf"], "has no /tf topic of type tf2_msgs/msg/TFMessage"),
     "stamps apart": (
         lambda: ((s, t, k, m) for s, t, k, m in odometry_log_entries() if k != ODOMETRY or s < T0 - 50 * MS),
         [],

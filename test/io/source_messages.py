@@ -141,6 +141,19 @@ def odometry_log_entries(**images):
     yield from image_entries(**images)
 
 
+def tf_log_entries(**images):
+    """The odometry as /tf tells it, beside a localization that moves it and an arm that moves on the robot."""
+    for entry in odometry_log_entries(**images):
+        stamp_ns, _, kind, message = entry
+        if kind != ODOMETRY:
+            yield entry
+            continue
+        T = SE3.from_quat(ros.xyzw(message.pose.pose.orientation), ros.xyz(message.pose.pose.position))
+        moving = [("map", "odom", T_ODOM_MAP.inverse()), ("/odom", "/base", T), ("base", "arm", T)]
+        for one in moving:
+            yield stamp_ns, "/tf", TF, transforms_message(types, stamp_ns, [one])
+
+
 def as_double(stamp_ns):
     """What a stamp is after it was a double of seconds, as in VINS."""
     return round((stamp_ns / 1e9) * 1e9)
@@ -175,7 +188,7 @@ def openvins_entries():
     yield from keyframe_entries("openvins")
 
 
-ENTRIES = {"odometry": odometry_log_entries, "vins": vins_entries, "openvins": openvins_entries}
+ENTRIES = {"odometry": odometry_log_entries, "tf": tf_log_entries, "vins": vins_entries, "openvins": openvins_entries}
 
 
 def write_source_log(path, entries):

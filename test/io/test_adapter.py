@@ -1,5 +1,6 @@
 """Each kind of source with its quirks: the camera's pose, features, positions; and what a message that is wrong gets."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import image_world
@@ -20,6 +21,7 @@ from source_messages import (
     odometry_log_entries,
     openvins_entries,
     point_cloud,
+    tf_log_entries,
     types,
     vins_entries,
 )
@@ -30,7 +32,7 @@ from xalign_ros.core.extraction import orb
 from xalign_ros.core.records import Features
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io import ros_fields as ros
-from xalign_ros.io.adapter import IMAGES, KINDS, Adapter, SourceOptions, keyframe_from_frame
+from xalign_ros.io.adapter import IMAGES, KINDS, PLAIN, Adapter, SourceOptions, keyframe_from_frame
 from xalign_ros.io.frame_messages import TF
 from xalign_ros.io.image_message import COMPRESSED, IMAGE
 from xalign_ros.io.log import typestore
@@ -40,7 +42,7 @@ SOME = Selection(moved_m=0.1, moved_s=0.15)
 
 
 def roles(kind):
-    named = {role.topic: name for name, role in KINDS[kind].items()}
+    named = {role.topic.rpartition("/")[2]: name for name, role in KINDS[kind].items()}
     return named | {"odom": "pose", "image_raw": "image", "compressed": "compressed", "tf_static": "static"}
 
 
@@ -69,10 +71,10 @@ def test_keyframes_have_the_camera_s_pose_and_the_image_s_features(kind):
     found, adapter = keyframes_of(kind, ENTRIES[kind]())
     assert len(found) >= 10 and not adapter.refused and not any(fault for _, fault in found)
     # Between poses 10 ms apart the walk is no screw, by 0.1 mm; VINS's own poses are those of the images.
-    assert max(pose_error(k) for k, _ in found) < (2e-4 if kind == "odometry" else 1e-6)
+    assert max(pose_error(k) for k, _ in found) < (2e-4 if kind in PLAIN else 1e-6)
     assert all(k.features.name == "orb" and len(k.features) > 100 for k, _ in found)
     assert all(k.camera.width == 400 and k.camera.model == "radtan" for k, _ in found)
-    assert {k.metric_scale for k, _ in found} == {kind != "odometry"} and {k.session for k, _ in found} == {0}
+    assert {k.metric_scale for k, _ in found} == {kind not in PLAIN} and {k.session for k, _ in found} == {0}
     assert [k.id for k, _ in found] == list(range(len(found))) and {k.cam_frame for k, _ in found} == {"cam"}
     stamps = [k.stamp_ns for k, _ in found]
     assert stamps == sorted(set(stamps)) and all((s - T0) % (IMAGE_MS * MS) == 0 for s in stamps)
@@ -82,6 +84,27 @@ def test_frames_are_those_of_the_source():
     for kind, entries, name in (("odometry", odometry_log_entries, "odom"), ("vins", vins_entries, "world")):
         assert {f.odom_frame for f in frames_of(kind, entries())[0]} == {name}
     assert {f.odom_frame for f in frames_of("openvins", openvins_entries())[0]} == {"global"}
+
+
+def test_tf_gives_the_frames_that_the_odometry_gives():
+    """Also where a broadcaster tells a transform twice, or one that is none."""
+
+    def noisy():
+        for n, entry in enumerate(tf_log_entries()):
+            yield entry
+            if entry[1] == "/tf" and n % 40 == 0:
+                yield entry
+                broken = deepcopy(entry[3])
+                broken.transforms[0].transform.rotation.w = np.nan
+                yield entry[0] + 1, "/tf", TF, broken
+
+    plain, _ = frames_of("odometry", odometry_log_entries())
+    found, adapter = frames_of("tf", noisy())
+    assert [f.stamp_ns for f in found] == [f.stamp_ns for f in plain]
+    assert {(f.odom_frame, f.metric) for f in found} == {("odom", False)}
+    for ours, theirs in zip(found, plain, strict=True):
+        np.testing.assert_allclose(ours.T_odom_cam.t, theirs.T_odom_cam.t, atol=1e-12)
+    assert set(adapter.refused) <= {"bad_pose", "stamp_backwards", "duplicate"} and adapter.refused["bad_pose"]
 
 
 @pytest.mark.parametrize("kind", ["vins", "openvins"])
@@ -254,7 +277,7 @@ def test_an_extractor_that_fails_is_told():
 
 
 def test_an_unknown_kind_is_refused():
-    with pytest.raises(ConfigError, match="no source 'orbslam'; it is one of keyframes, odometry, vins, openvins"):
+    with pytest.raises(ConfigError, match="no source 'orbslam'; it is one of keyframes, odometry, tf, vins, openvins"):
         SourceOptions("orbslam")
 
 

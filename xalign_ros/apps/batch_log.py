@@ -65,7 +65,7 @@ class Job:
             "xalign": self.xalign,
             "map": self.map_version,
             "options": {key: value for key, value, _ in options(self.config)},
-            "source": [s.kind, s.features, s.metric_scale],
+            "source": [s.kind, s.features, s.metric_scale, s.odom_frame],
             "camera": camera and [camera.model, camera.K.tolist(), camera.D.tolist(), camera.width, camera.height],
             "base_from_cam": T and [T.R.tolist(), T.t.tolist()],
             "topics": list(self.chosen),

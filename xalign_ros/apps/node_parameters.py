@@ -36,10 +36,11 @@ class Live:
     base_frame: str = option("", "", "child frame of odometry_corrected; empty: that of the odometry")
     frame_prefix: str = option("", "", "put before map_frame and base_frame; frames of messages stay as they come")
     base_from_cam: tuple[float, ...] = field(default=IDENTITY, metadata=SEVEN)
-    source: str = option("keyframes", "", "keyframes, or odometry, vins, openvins with images")
+    source: str = option("keyframes", "", "keyframes, or odometry, tf, vins, openvins with images")
     features: str = option("", "", "of images: extractor, or module:function; empty: that of the map")
     camera: str = option("", "", "of images: calibration file, where no camera_info comes")
-    metric_scale: bool = option(False, "", "of source odometry: its unit is the metre")
+    metric_scale: bool = option(False, "", "of source odometry or tf: its unit is the metre")
+    odom_frame: str = option("odom", "", "of source tf: the frame of the odometry")
     autostart: bool = option(True, "", "configure and activate at once; false: wait for a lifecycle manager")
     publish_tf: bool = option(True, "", "send map -> odom on /tf")
     tf_smooth: bool = option(False, "", "send the smooth pose's map -> odom instead of the raw one's")
@@ -62,7 +63,8 @@ class Live:
     def of_source(self) -> SourceOptions:
         """Raises ConfigError and FormatError."""
         camera = read_camera(Path(self.camera)) if self.camera else None
-        return SourceOptions(self.source, self.features, camera, self.T_base_cam, self.metric_scale)
+        about = (self.T_base_cam, self.metric_scale, self.odom_frame)
+        return SourceOptions(self.source, self.features, camera, *about)
 
     @property
     def folder(self) -> Path:

@@ -46,8 +46,8 @@ class NodeSource:
         for role, topic in (KINDS[kind] | IMAGES).items():
             if (kind, role) == ("odometry", "pose"):
                 continue
-            own = kind != "odometry" and role in ("pose", "points", "extrinsic")
-            part = "image" if role in IMAGES else topic.topic if role == "pose" else ""
+            own = role in ("pose", "moving", "points", "extrinsic")
+            part = "image" if role in IMAGES else topic.topic if role in ("pose", "moving") else ""
             yield Ear(role, topic, QUEUE if own else LOSSY, MOST_BYTES.get(role, SMALL_BYTES), part)
 
     def take(self, role: str, message: Any) -> None:

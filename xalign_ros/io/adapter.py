@@ -6,6 +6,7 @@ nobody has looked at yet; `keyframe_from_frame` does that, in another process if
 | kind     | pose                  | points         | camera in base   | intrinsics       |
 |----------|-----------------------|----------------|------------------|------------------|
 | odometry | Odometry, at any rate |                | /tf_static       | camera_info      |
+| tf       | /tf, out of one frame |                | /tf_static       | camera_info      |
 | vins     | keyframe_pose         | keyframe_point | extrinsic        | camera_info      |
 | openvins | loop_pose             | loop_feats     | loop_extrinsic   | loop_intrinsics  |
 
@@ -33,7 +34,7 @@ from xalign_ros.core.source import MOST_BYTES, MOST_IMAGES, KeyframeSource, Odom
 from xalign_ros.core.trail import Trail
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io import ros_fields as ros
-from xalign_ros.io.frame_messages import TF, StaticTree
+from xalign_ros.io.frame_messages import TF, StaticTree, frames_of, transform_of
 from xalign_ros.io.image_message import COMPRESSED, IMAGE, RawImage, pixels, raw_image
 from xalign_ros.io.keyframe_fields import NO_FEATURES
 from xalign_ros.io.odometry_message import ODOMETRY, odometry_pose
@@ -51,6 +52,7 @@ class Role(NamedTuple):
 
 KINDS: dict[str, dict[str, Role]] = {
     "odometry": {"pose": Role("odometry", ODOMETRY), "camera": Role("camera_info", CAMERA_INFO)},
+    "tf": {"moving": Role("/tf", TF), "camera": Role("camera_info", CAMERA_INFO)},
     "vins": {
         "pose": Role("keyframe_pose", ODOMETRY),
         "points": Role("keyframe_point", POINTS),
@@ -66,6 +68,9 @@ KINDS: dict[str, dict[str, Role]] = {
 }
 IMAGES = {"image": Role("image", IMAGE), "compressed": Role("image/compressed", COMPRESSED)}
 STATIC = {"static": Role("/tf_static", TF)}
+PLAIN = ("odometry", "tf")  # kinds whose poses come at a rate of their own, between which images are
+ODOM_FRAME = "odom"  # of REP-105
+MOST_NAMED = 12  # transforms, in a sentence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +78,8 @@ class SourceOptions:
     """What the source is and what it does not tell itself.
 
     features names the extractor ("" = the map's); camera and T_base_cam, where given, go before what messages say;
-    metric_scale is about the odometry of kind "odometry", the others are metric.
+    metric_scale is about the odometry of the PLAIN kinds, the others are metric; odom_frame is the frame that the poses of
+    kind "tf" lead out of.
     """
 
     kind: str = "keyframes"
@@ -81,6 +87,7 @@ class SourceOptions:
     camera: Camera | None = None
     T_base_cam: SE3 | None = None
     metric_scale: bool = False
+    odom_frame: str = ODOM_FRAME
 
     def __post_init__(self) -> None:
         if self.kind not in ("keyframes", *KINDS):
@@ -88,7 +95,7 @@ class SourceOptions:
 
     @property
     def metric(self) -> bool:
-        return self.metric_scale or self.kind != "odometry"
+        return self.metric_scale or self.kind not in PLAIN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,11 +120,12 @@ class Frame:
 class _Heard:
     """What the messages said last."""
 
-    odom_frame: str = "odom"
+    odom_frame: str = ODOM_FRAME
     base_frame: str = ""
     camera: Any = None
     T_base_cam: SE3 | None = None
     tree: StaticTree = field(default_factory=StaticTree)
+    others: dict[tuple[str, str], None] = field(default_factory=dict)  # transforms that move, out of other frames
 
 
 class Adapter:
@@ -129,7 +137,7 @@ class Adapter:
         trail = Trail(selection, options.metric)
         self._source: Source = OdometrySource(trail, self._refuse)
         self._selector: Selector | None = Selector(selection, options.metric)
-        if options.kind != "odometry":
+        if options.kind not in PLAIN:
             self._source, self._selector = KeyframeSource(trail, self._refuse, with_points), None
         self._shots: deque[Shot] = deque()
         self._heard = _Heard(camera=options.camera, T_base_cam=options.T_base_cam)
@@ -162,6 +170,20 @@ class Adapter:
             return
         self._heard.odom_frame, self._heard.base_frame = str(msg.header.frame_id), str(msg.child_frame_id)
         self._shots += self._source.pose(ros.stamp_of(msg.header.stamp), T_odom_base)
+
+    def _take_moving(self, msg: Any) -> None:
+        """Of a TFMessage the transforms out of the odometry's frame; all of them are to one base."""
+        heard, odom = self._heard, self._options.odom_frame.lstrip("/")
+        for stamped in msg.transforms:
+            (parent, child), T = frames_of(stamped), transform_of(stamped)
+            if parent != odom or child != (heard.base_frame or child):
+                if len(heard.others) < MOST_NAMED:
+                    heard.others[parent, child] = None
+            elif T is None:
+                self._refuse("bad_pose", f"a transform from '{parent}' to '{child}' holds no pose")
+            else:
+                heard.odom_frame, heard.base_frame = parent, child
+                self._shots += self._source.pose(ros.stamp_of(stamped.header.stamp), T)
 
     def _take_points(self, msg: Any) -> None:
         try:
@@ -208,7 +230,7 @@ class Adapter:
 
     def _mount(self, shot: Shot) -> SE3 | None:
         """T_base_cam: as given, as the source told, the identity where both are one frame, else from /tf_static."""
-        if self._heard.T_base_cam is not None or self._options.kind != "odometry":
+        if self._heard.T_base_cam is not None or self._options.kind not in PLAIN:
             return self._heard.T_base_cam
         base, cam = self._heard.base_frame, shot.image.frame
         return self._heard.tree.between(base, cam) if base and cam else None
@@ -222,14 +244,21 @@ class Adapter:
     def missing(self) -> str:
         """What waiting images wait for, in words; "" where none waits for more than poses."""
         if not self._shots:
-            return ""
+            return self._elsewhere()
         if self._heard.camera is None:
             return "the camera's intrinsics are unknown: no camera info came, and no camera file is given"
         base, cam = self._heard.base_frame, self._shots[0].image.frame
-        if self._options.kind == "odometry":
+        if self._options.kind in PLAIN:
             told = f"the place of the camera ('{cam}') on '{base}' is unknown"
             return f"{told}: /tf_static does not tell it, and base_from_cam is not given"
         return "the place of the camera is unknown: no extrinsic came, and base_from_cam is not given"
+
+    def _elsewhere(self) -> str:
+        """What /tf tells of other frames than that of the odometry, where it tells nothing of that one."""
+        if self._heard.base_frame or not self._heard.others:
+            return ""
+        told = ", ".join(f"{parent} -> {child}" for parent, child in self._heard.others)
+        return f"/tf has no transform out of '{self._options.odom_frame}'; it has {told}: name the frame by odom_frame"
 
     def _refuse(self, reason: str, detail: str) -> None:
         self.refused[reason] += 1

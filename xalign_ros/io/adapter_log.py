@@ -16,7 +16,16 @@ from xalign_ros.core.extraction import EXTRACTORS, Extract
 from xalign_ros.core.records import Keyframe, Rejection
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3
-from xalign_ros.io.adapter import CAMERA_INFO, IMAGES, KINDS, Adapter, SourceOptions, keyframe_from_frame
+from xalign_ros.io.adapter import (
+    CAMERA_INFO,
+    IMAGES,
+    KINDS,
+    ODOM_FRAME,
+    PLAIN,
+    Adapter,
+    SourceOptions,
+    keyframe_from_frame,
+)
 from xalign_ros.io.camera_file import read_camera
 from xalign_ros.io.frame_messages import TF
 from xalign_ros.io.image_message import COMPRESSED, IMAGE
@@ -49,12 +58,16 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", type=Path, metavar="FILE", help="calibration, where the log has no camera info")
     seven = "camera in the odometry's child frame, x y z qx qy qz qw, where the log does not tell it"
     parser.add_argument("--base-from-cam", type=float, nargs=7, metavar="X", help=seven)
-    parser.add_argument("--metric-scale", action="store_true", help="with --source odometry: its unit is the metre")
+    parser.add_argument(
+        "--metric-scale", action="store_true", help="with --source odometry | tf: its unit is the metre"
+    )
+    parser.add_argument("--odom-frame", metavar="FRAME", help="with --source tf: frame of the odometry (default: odom)")
 
 
 def read_source(args: argparse.Namespace) -> SourceOptions:
     """Raises ConfigError and FormatError."""
-    given = [n for n in ("image_topic", "features", "camera", "base_from_cam", "metric_scale") if getattr(args, n)]
+    names = ("image_topic", "features", "camera", "base_from_cam", "metric_scale", "odom_frame")
+    given = [n for n in names if getattr(args, n)]
     if args.source == "keyframes" and given:
         raise ConfigError(f"--{given[0].replace('_', '-')} is for a log of odometry and images: give --source")
     T_base_cam = None
@@ -64,7 +77,10 @@ def read_source(args: argparse.Namespace) -> SourceOptions:
             raise ConfigError(f"--base-from-cam must be x y z qx qy qz qw with |q| = 1, not {seven.tolist()}")
         T_base_cam = SE3.from_quat(seven[3:], seven[:3])
     camera = read_camera(args.camera) if args.camera is not None else None
-    return SourceOptions(args.source, args.features, camera, T_base_cam, args.metric_scale)
+    if args.odom_frame and args.source != "tf":
+        raise ConfigError("--odom-frame is for --source tf; an odometry's messages name their frame")
+    frame = args.odom_frame or ODOM_FRAME
+    return SourceOptions(args.source, args.features, camera, T_base_cam, args.metric_scale, frame)
 
 
 def extractor_for(map_: ReferenceMap, name: str) -> Extract:
@@ -108,14 +124,15 @@ def log_keyframes(
 def source_topics(path: Path, topics: list[Topic], options: SourceOptions, chosen: Chosen) -> dict[str, str]:
     """The role of each topic that the source needs. Raises LogError, naming what there is, where that is not one each."""
     parts = KINDS[options.kind]
-    poses = [t.name for t in topics if t.type == ODOMETRY and _last(t.name) == parts["pose"].topic]
+    role = "moving" if options.kind == "tf" else "pose"
+    what, type_ = parts[role]
+    poses = [t.name for t in topics if t.type == type_ and _last(t.name) == _last(what)]
     if options.kind == "odometry":
         poses = [t.name for t in topics if t.type == ODOMETRY and _last(t.name) not in NO_SOURCE.union(OUTPUTS)]
         exact = [name for name in poses if name.strip("/") == "odometry"]
         poses = exact or poses
-    what = "odometry" if options.kind == "odometry" else parts["pose"].topic
-    pose = _one(path, poses, chosen.pose, what, ODOMETRY, "--keyframe-topic", topics)
-    roles = {pose: "pose"}
+    pose = _one(path, poses, chosen.pose, what, type_, "--keyframe-topic", topics)
+    roles = {pose: role}
     present = {(t.name, t.type) for t in topics}
     image = _one(path, _views(topics), chosen.image, "image", IMAGE, "--image-topic", topics)
     roles[image] = "image" if (image, IMAGE) in present else "compressed"
@@ -134,7 +151,7 @@ def source_topics(path: Path, topics: list[Topic], options: SourceOptions, chose
             told = f"{path} has several topics of type {CAMERA_INFO} and none is {_camera_of(image)}"
             raise LogError(f"{told}; give the calibration by --camera FILE: {', '.join(infos)}")
         roles[(near or infos)[0]] = "camera"
-    if options.kind != "odometry" and options.T_base_cam is None and "extrinsic" not in roles.values():
+    if options.kind not in PLAIN and options.T_base_cam is None and "extrinsic" not in roles.values():
         raise LogError(f"{path} has no topic {parts['extrinsic'].topic} beside {pose}; give --base-from-cam")
     return roles | {t.name: "static" for t in topics if t.type == TF and _last(t.name) == "tf_static"}
 
@@ -143,8 +160,9 @@ def sources_of(topics: list[Topic]) -> list[str]:
     """The kinds of source that a log can be, as far as its topics tell."""
     found = ["keyframes"] if any(t.type == KEYFRAME for t in topics) else []
     for kind in KINDS if _views(topics) else ():
-        names = {_last(t.name) for t in topics if t.type == ODOMETRY}
-        if (kind == "odometry" and names - NO_SOURCE - set(OUTPUTS)) or KINDS[kind]["pose"].topic in names:
+        names = {_last(t.name) for t in topics if t.type == (TF if kind == "tf" else ODOMETRY)}
+        own = {"odometry": names - NO_SOURCE - set(OUTPUTS), "tf": names & {"tf"}}
+        if own[kind] if kind in PLAIN else KINDS[kind]["pose"].topic in names:
             found.append(kind)
     return found
 

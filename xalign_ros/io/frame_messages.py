@@ -26,6 +26,18 @@ def transforms_message(types: Types, stamp_ns: int, transforms: Iterable[tuple[s
     return types(TF)(transforms=filled)
 
 
+def frames_of(stamped: Any) -> tuple[str, str]:
+    """Parent and child of a TransformStamped, without the leading slash of ROS 1."""
+    return stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
+
+
+def transform_of(stamped: Any) -> SE3 | None:
+    """T_parent_child of a TransformStamped; None where it holds none."""
+    t, q = ros.xyz(stamped.transform.translation), ros.xyzw(stamped.transform.rotation)
+    sound = np.isfinite(t).all() and np.isfinite(q).all() and abs(np.hypot.reduce(q) - 1) < QUAT_TOLERANCE
+    return SE3.from_quat(q, t) if sound else None
+
+
 class StaticTree:
     """The transforms of /tf_static by child frame; a frame has one parent, the last that was heard."""
 
@@ -35,11 +47,9 @@ class StaticTree:
     def hear(self, message: Any) -> None:
         """Takes a tf2_msgs/TFMessage; what is no transform is left out."""
         for stamped in message.transforms:
-            t, q = ros.xyz(stamped.transform.translation), ros.xyzw(stamped.transform.rotation)
-            child = stamped.child_frame_id.lstrip("/")
-            sound = np.isfinite(t).all() and np.isfinite(q).all() and abs(np.hypot.reduce(q) - 1) < QUAT_TOLERANCE
-            if sound and (child in self._parent or len(self._parent) < MOST_FRAMES):
-                self._parent[child] = stamped.header.frame_id.lstrip("/"), SE3.from_quat(q, t)
+            (parent, child), T = frames_of(stamped), transform_of(stamped)
+            if T is not None and (child in self._parent or len(self._parent) < MOST_FRAMES):
+                self._parent[child] = parent, T
 
     def between(self, a: str, b: str) -> SE3 | None:
         """T_a_b; None where the two are not tied together."""
