@@ -98,7 +98,7 @@ def test_an_image_that_is_none_is_refused(painted, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["-p", "source:=slam"], "there is no source 'slam'; it is one of keyframes, odometry, vins, openvins"),
+        (["-p", "source:=slam"], "there is no source 'slam'; it is one of keyframes, odometry, tf, vins, openvins"),
         (["-p", "source:=vins", "-p", "features:=sift"], "the map's features are 'orb', not 'sift'"),
         (["-p", "source:=vins", "-p", "camera:=/nowhere.yaml"], "/nowhere.yaml"),
     ],
