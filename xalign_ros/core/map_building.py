@@ -16,7 +16,7 @@ from xalign_ros.core.pnp import Points2D3D, Pose, refine_pose
 from xalign_ros.core.progress import Progress, unseen
 from xalign_ros.core.records import NO_TRACK, Keyframe, Norm
 from xalign_ros.core.reference_map import ReferenceMap
-from xalign_ros.core.tracks import matched_tracks, merged_tracks, seen_twice
+from xalign_ros.core.tracks import matched_tracks, merged_tracks, seen_once, seen_twice
 from xalign_ros.core.transforms import SE3, Sim3
 from xalign_ros.core.triangulation import Triangulated, triangulate
 
@@ -64,7 +64,8 @@ def build_map(
     metric: bool,
     progress: Progress = unseen,
 ) -> ReferenceMap:
-    """The map of posed keyframes (poses are T_map_cam), by track id where every feature set has ids, else by matching.
+    """The map of posed keyframes (poses are T_map_cam): by track id where every feature set has ids, and for the features
+    without a track, or whose track no other keyframe has, by matching.
 
     Raises ValueError when the keyframes do not share one descriptor or no point can be triangulated.
     """
@@ -76,7 +77,11 @@ def build_map(
     features = [k.features for k in keyframes]
     each = [_camera(k) for k in keyframes]
     obs = Observations(each, [f.uv for f in features], [f.descriptors for f in features], poses)
-    track = _track_ids(keyframes, obs) if _have_tracks(keyframes) else matched_tracks(keyframes, poses, progress)
+    track = _track_ids(keyframes, obs) if _have_tracks(keyframes) else np.full(len(obs.uv), -1)
+    found = matched_tracks(
+        keyframes, poses, progress, seen_once(track)
+    )  # a tracker that lost a thing has no more of it
+    track = np.where(found >= 0, found + track.max() + 1, track)
     cameras, which = _distinct_cameras(each)
     used = np.flatnonzero((track >= 0) & obs.valid)
     track_index, compact = np.unique(track[used], return_inverse=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -25,13 +26,21 @@ CHI2_99 = 11.34  # of three degrees of freedom
 EPIPOLAR_PX = 8.0  # at twice the keypoint noise this still leaves room for a degree of pose error
 
 
-def matched_tracks(keyframes: Sequence[Keyframe], poses: Sequence[SE3], progress: Progress = unseen) -> np.ndarray:
-    """Track (F,) of every feature of all keyframes in order, -1 = none; no track has two features of one keyframe."""
+def matched_tracks(
+    keyframes: Sequence[Keyframe], poses: Sequence[SE3], progress: Progress = unseen, free: np.ndarray | None = None
+) -> np.ndarray:
+    """Track (F,) of every feature of all keyframes in order, -1 = none; no track has two features of one keyframe.
+
+    `free` (F,) bool are those that may be in one; all, if not given.
+    """
     sizes = [len(k.features) for k in keyframes]
     offset = np.r_[0, np.cumsum(sizes)]
-    rays = [_rays(k) for k in keyframes]
+    free = np.ones(offset[-1], bool) if free is None else free
+    sides = [
+        _Side(k, np.flatnonzero(free[start:end])) for k, (start, end) in zip(keyframes, pairwise(offset), strict=True)
+    ]
     links = [
-        offset[[a, b]][:, None] + _pair(keyframes[a], keyframes[b], rays[a], rays[b], poses[a].inverse() @ poses[b])
+        offset[[a, b]][:, None] + _pair(sides[a], sides[b], poses[a].inverse() @ poses[b])
         for a, b in progress(_pairs(poses), "matching keyframes")
     ]
     link = np.concatenate(links, axis=1) if links else np.zeros((2, 0), np.int64)
@@ -42,6 +51,17 @@ def matched_tracks(keyframes: Sequence[Keyframe], poses: Sequence[SE3], progress
     track = np.where(linked, track, -1)
     track[seen_twice(track, np.repeat(np.arange(len(sizes)), sizes))] = -1
     return track
+
+
+class _Side:
+    """Some rows of a keyframe's features, to be matched with another one's."""
+
+    def __init__(self, keyframe: Keyframe, rows: np.ndarray) -> None:
+        assert keyframe.camera is not None
+        self.rows, self.norm = rows, keyframe.features.norm
+        self.descriptors = keyframe.features.descriptors[rows]
+        self.rays = keyframe.camera.unproject(keyframe.features.uv[rows])[0]
+        self.focal = float(keyframe.camera.K[:2].mean())
 
 
 def merged_tracks(
@@ -74,6 +94,12 @@ def merged_tracks(
     return np.asarray(merged[track])
 
 
+def seen_once(track: np.ndarray) -> np.ndarray:
+    """Observations (F,) bool without a track (-1), or that are all of theirs."""
+    counts = np.bincount(track[track >= 0], minlength=1)
+    return np.asarray((track < 0) | (counts[np.maximum(track, 0)] < 2))
+
+
 def seen_twice(track: np.ndarray, frame: np.ndarray) -> np.ndarray:
     """Observations (F,) bool of a track that has two in one keyframe: at least one of them is wrong."""
     order = np.lexsort((frame, track))
@@ -96,23 +122,17 @@ def _pairs(poses: Sequence[SE3]) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def _rays(keyframe: Keyframe) -> Array:
-    assert keyframe.camera is not None
-    return keyframe.camera.unproject(keyframe.features.uv)[0]
-
-
-def _pair(a: Keyframe, b: Keyframe, rays_a: Array, rays_b: Array, T_a_b: SE3) -> np.ndarray:
-    """Matched rows (2, N): mutually nearest, passing the ratio test both epipolar and by descriptor."""
-    if len(a.features) < 2 or len(b.features) < 2:
+def _pair(a: _Side, b: _Side, T_a_b: SE3) -> np.ndarray:
+    """Matched features (2, N): mutually nearest, passing the ratio test both epipolar and by descriptor."""
+    if len(a.rows) < 2 or len(b.rows) < 2:
         return np.zeros((2, 0), np.int64)
-    norm = a.features.norm
-    forth, distance = nearest(a.features.descriptors, b.features.descriptors, norm, 2)
-    back, _ = nearest(b.features.descriptors, a.features.descriptors, norm, 1)
+    forth, distance = nearest(a.descriptors, b.descriptors, a.norm, 2)
+    back, _ = nearest(b.descriptors, a.descriptors, a.norm, 1)
     rows = np.arange(len(forth))
     keep = (back[forth[:, 0], 0] == rows) & (distance[:, 0] <= RATIO * distance[:, 1])
     i, j = rows[keep], forth[keep, 0]
-    assert a.camera is not None
-    return np.stack([i, j])[:, _epipolar_rad(rays_a[i], rays_b[j], T_a_b) < EPIPOLAR_PX / a.camera.K[:2].mean()]
+    close = _epipolar_rad(a.rays[i], b.rays[j], T_a_b) < EPIPOLAR_PX / a.focal
+    return np.stack([a.rows[i], b.rows[j]])[:, close]
 
 
 def _epipolar_rad(ray_a: Array, ray_b: Array, T_a_b: SE3) -> Array:
