@@ -20,6 +20,7 @@ import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import xalign_ros
+from xalign_ros.io.log import LogWriter
 from xalign_ros.io.msgdefs import message_definitions
 
 ROOT = Path(__file__).parents[1]
@@ -219,6 +220,32 @@ def test_wheel_brings_its_message_texts_and_commands(tmp_path):
     assert (share / "config/xalign.launch.py").exists()
     assert (share.parent / "ament_index/resource_index/packages/xalign_ros").exists()
     assert {path.name for path in prefix.rglob("bin/*")} == {"xalign", "xalign_node"}
+
+
+WITHOUT_TEXTS = {
+    "eval": ["run.mcap", "truth.tum"],
+    "map": ["build", "--log", "run.mcap", "--poses", "truth.tum", "-o", "m.xmap"],
+}
+
+
+@pytest.mark.parametrize("command", WITHOUT_TEXTS)
+def test_a_package_without_its_message_texts_says_so(command, tmp_path):
+    """A sound log is not called damaged for it."""
+    topics = {"keyframes": "xalign_msgs/msg/Keyframe", "correction": "xalign_msgs/msg/Correction"}
+    with LogWriter(tmp_path / "run.mcap") as log:
+        for topic, name in topics.items():
+            log.write_bytes(log.channel(topic, name), b"", 1)
+    (tmp_path / "truth.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    shutil.copytree(ROOT / "xalign_ros", tmp_path / "bare" / "xalign_ros")
+    done = subprocess.run(
+        [sys.executable, "-m", "xalign_ros", command, *WITHOUT_TEXTS[command]],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "bare")},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+    assert "the message texts of xalign_msgs" in done.stderr and "pip install" in done.stderr
 
 
 def test_launch_file_compiles(tmp_path):

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from xalign_ros.core.errors import LogError
+from xalign_ros.core.errors import LogError, XalignError
 from xalign_ros.core.records import Anchor, Correction, Rejection
-from xalign_ros.io.log import Log
+from xalign_ros.io.log import Log, RawMessage
 from xalign_ros.io.messages import anchor_from_message, correction_from_message
 
 CORRECTION, ANCHOR = "xalign_msgs/msg/Correction", "xalign_msgs/msg/Anchor"
+Record = TypeVar("Record")
 
 
 class Recorded(NamedTuple):
@@ -30,11 +32,7 @@ def read_corrections(path: Path) -> list[Recorded]:
             )
         found = {}
         for message in log.raw_messages(names):
-            try:
-                correction = correction_from_message(message.message())
-            except Exception as error:
-                where = f"the message on {message.topic} at {message.log_time_ns} ns"
-                raise LogError(f"{path} is damaged: {where} is no {CORRECTION}") from error
+            correction = _read(path, message, correction_from_message)
             found[correction.stamp_ns] = Recorded(correction, message.log_time_ns)
     return [found[stamp_ns] for stamp_ns in sorted(found)]
 
@@ -45,9 +43,15 @@ def read_anchors(path: Path) -> list[Anchor | Rejection]:
         names = [topic.name for topic in log.topics() if topic.type == ANCHOR]
         found = []
         for message in log.raw_messages(names[:1]):
-            try:
-                found.append(anchor_from_message(message.message()))
-            except Exception as error:
-                where = f"the message on {message.topic} at {message.log_time_ns} ns"
-                raise LogError(f"{path} is damaged: {where} is no {ANCHOR}") from error
+            found.append(_read(path, message, anchor_from_message))
     return found
+
+
+def _read(path: Path, message: RawMessage, record_from: Callable[[Any], Record]) -> Record:
+    try:
+        return record_from(message.message())
+    except XalignError:  # of the message texts, which no log can help
+        raise
+    except Exception as error:
+        where = f"the message on {message.topic} at {message.log_time_ns} ns"
+        raise LogError(f"{path} is damaged: {where} is no {message.type}") from error

@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+from xalign_ros.core.errors import ConfigError
+
 
 def message_definitions() -> dict[str, str]:
-    """Type name, as in "xalign_msgs/msg/Keyframe", to .msg text."""
+    """Type name, as in "xalign_msgs/msg/Keyframe", to .msg text. Raises ConfigError where they are not installed."""
     return {f"xalign_msgs/msg/{path.stem}": path.read_text(encoding="utf-8") for path in _texts()}
 
 
@@ -14,4 +16,7 @@ def _texts() -> list[Path]:
         for folder in ("share/xalign_ros/msg", "msg_defs/msg"):
             if texts := sorted((root / folder).glob("*.msg")):
                 return texts
-    raise FileNotFoundError("the message texts (share/xalign_ros/msg or msg_defs/msg) are not installed")
+    told = "the message texts of xalign_msgs (share/xalign_ros/msg, in a source tree msg_defs/msg) are not installed"
+    raise ConfigError(
+        f"{told}: install the whole package with make setup, pip install or colcon, do not copy its folder"
+    )
