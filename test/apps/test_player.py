@@ -14,7 +14,7 @@ import worlds
 from live_world import FAULTS, LiveWorld
 
 from xalign_ros.core.intake import SETBACK_IN_A_ROW
-from xalign_ros.io.log import Log, typestore
+from xalign_ros.io.log import Log, LogWriter, typestore
 from xalign_ros.io.messages import KEYFRAME, correction_digest, correction_fields_from_message, keyframe_message
 from xalign_ros.io.ros_fields import ros_types
 from xalign_ros.io.step_messages import TOPICS
@@ -86,6 +86,22 @@ def test_live_run_equals_replay_to_the_last_bit(world, in_process, tmp_path, rat
     assert set(ours["state"]) <= set(replayed["state"])  # a state may be overtaken by the next one
     assert len(trajectory.read_text().splitlines()) == len(mine)
     assert list(report.glob("*.html"))
+
+
+@pytest.mark.slow
+def test_keyframes_of_one_log_time_are_played_in_the_order_of_replay(world, tmp_path):
+    """As a recorder may write them that gets three at once."""
+    types, log = typestore().types.__getitem__, tmp_path / "thirds.mcap"
+    with LogWriter(log) as writer:
+        for n in range(0, len(world.run.keyframes), 3):
+            three = world.run.keyframes[n : n + 3]
+            for k in reversed(three):
+                writer.write("keyframes", KEYFRAME, keyframe_message(types, k), three[-1].stamp_ns)
+    expected = live.result(live.xalign("replay", log, "--map", world.map, "--json"))
+    with live.node(tmp_path, world.map):
+        result = live.result(played(world, log, "--json"))
+    assert result["hash"] == expected["hash"]
+    assert result["keyframes_rejected"] == expected["keyframes_rejected"] == {}
 
 
 @pytest.mark.slow

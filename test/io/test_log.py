@@ -73,6 +73,37 @@ def test_order_is_by_time_and_equal_times_stay(kind, tmp_path):
         assert [keyframe.id for _, keyframe, _ in log.keyframes()] == expected
 
 
+@each_kind
+def test_what_is_played_comes_in_the_order_of_the_keyframes(kind, tmp_path):
+    rng = np.random.default_rng(22)
+    ids = [2, 1, 0, 5, 3, 4, 6]
+    keyframes = [a_keyframe(rng, id=k, stamp_ns=T0 + k // 3, n=2) for k in ids]
+    with Log(KINDS[kind](tmp_path, keyframes)) as log:
+        played = list(log.played(log.keyframe_topic()))
+        assert [keyframe.id for _, keyframe, _ in played] == [k.id for _, k, _ in log.keyframes()] == sorted(ids)
+        for raw, keyframe, _ in played:
+            assert_same_keyframe(m.keyframe_from_message(raw.message())[0], keyframe)
+        assert sorted(r.data for r in log.raw_messages()) == sorted(raw.data for raw, _, _ in played)
+
+
+def test_other_messages_that_are_played_stay_where_they_are(tmp_path):
+    pose = m.pose_message(TYPES, T0, SE3.identity(), np.eye(6), "map")
+    with LogWriter(tmp_path / "run.mcap") as writer:
+        for k in reversed(some_keyframes(3)):
+            writer.write("keyframes", m.KEYFRAME, m.keyframe_message(TYPES, k), T0)
+            writer.write("pose", "geometry_msgs/msg/PoseWithCovarianceStamped", pose, T0)
+    with Log(tmp_path / "run.mcap") as log:
+        played = [(raw.topic, keyframe and keyframe.id) for raw, keyframe, _ in log.played("keyframes", ["pose"])]
+    assert played == [
+        ("keyframes", 0),
+        ("pose", None),
+        ("keyframes", 1),
+        ("pose", None),
+        ("keyframes", 2),
+        ("pose", None),
+    ]
+
+
 def test_rejections_come_with_their_keyframes(tmp_path):
     message = m.keyframe_message(TYPES, some_keyframes(1)[0])
     with LogWriter(tmp_path / "run.mcap") as writer:

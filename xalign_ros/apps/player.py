@@ -146,16 +146,14 @@ class Player(Node):
 
     def play(self, log: Log, topic: str, rate: float) -> None:
         """At `rate` times the log's own time; 0 = as fast as the node answers."""
-        keyframes = log.keyframes(topic)  # beside the bytes: what they say, and whether they are sound
         begin_s, first_ns = time.monotonic(), None
-        for raw in log.raw_messages({topic, *odometry_topics(log)}):
+        for raw, keyframe, fault in log.played(topic, odometry_topics(log)):
             first_ns = raw.log_time_ns if first_ns is None else first_ns
             due_s = begin_s + (raw.log_time_ns - first_ns) / 1e9 / rate if rate else begin_s
             if raw.type == ODOMETRY:
                 self._until(lambda: True, due_s)
                 self._odometry.publish(bytes(raw.data))
             elif raw.type == KEYFRAME:
-                _, keyframe, fault = next(keyframes)
                 self._until(lambda: len(self._sent) - self._answered < AHEAD, due_s)
                 T_odom_cam = keyframe.T_odom_cam if keyframe is not None else None
                 self._sent.append(Sent(_who(keyframe if keyframe is not None else fault), T_odom_cam, time.monotonic()))

@@ -52,6 +52,15 @@ class RawMessage(NamedTuple):
         return deserialized(typestore(), self.data, self.type)
 
 
+class _Held(NamedTuple):
+    """A message as the file holds it; of a keyframe what it says."""
+
+    connection: Connection
+    time_ns: int
+    data: bytes
+    fields: KeyframeFields | None
+
+
 class Log:
     """A log open for reading, as context manager. Everything that is wrong with it is a LogError."""
 
@@ -133,34 +142,48 @@ class Log:
         So whatever order a recorder gave messages of one time, the keyframes are the same.
         Raises LogError where bytes are damaged or fewer messages come than the log announces.
         """
-        held: list[tuple[KeyframeFields, bytes]] = []
-        held_ns = 0
+        for one in self._ordered(self.keyframe_topic(topic)):
+            assert one.fields is not None
+            yield one.time_ns, *keyframe_of(one.fields)
+
+    def played(
+        self, topic: str, others: Iterable[str] = ()
+    ) -> Iterator[tuple[RawMessage, Keyframe | None, Rejection | None]]:
+        """A run as messages: the keyframes of `topic` in the order of `keyframes`, with what `keyframe_of` says.
+
+        Those of `others` (exact names) stay where the file has them.
+        """
+        for one in self._ordered(topic, others):
+            said = keyframe_of(one.fields) if one.fields is not None else (None, None)
+            yield self._raw(one.connection, one.time_ns, one.data), *said
+
+    def _ordered(self, topic: str, others: Iterable[str] = ()) -> Iterator[_Held]:
+        held: list[_Held] = []
+        names = set(others)
+        wanted = {(topic, KEYFRAME)} | {(name, kind) for name, kind in self._announced if name in names}
         try:
-            for connection, time_ns, data in self._read({(self.keyframe_topic(topic), KEYFRAME)}):
-                try:
-                    fields = self._keyframe_fields(connection, data)
-                except Exception as error:
-                    raise self._named(error, connection, time_ns) from error
-                if held and time_ns != held_ns:
-                    yield from _in_order(held_ns, held)
+            for connection, time_ns, data in self._read(wanted):
+                fields = None
+                if (connection.topic, connection.msgtype) == (topic, KEYFRAME):
+                    try:
+                        fields = self._keyframe_fields(connection, data)
+                    except Exception as error:
+                        raise self._named(error, connection, time_ns) from error
+                if held and time_ns != held[0].time_ns:
+                    yield from _in_order(held)
                     held = []
-                held.append((fields, data))
-                held_ns = time_ns
+                held.append(_Held(connection, time_ns, data, fields))
         except LogError:
-            yield from _in_order(held_ns, held)  # what came before it is sound
+            yield from _in_order(held)  # what came before it is sound
             raise
-        yield from _in_order(held_ns, held)
+        yield from _in_order(held)
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
         """The messages of `topics` (exact names; None = all) by log time; those of ROS 1 are converted to CDR."""
         known = set(self._announced)
         wanted = known if topics is None else {(name, kind) for name, kind in known if name in set(topics)}
         for connection, time_ns, data in self._read(wanted):
-            try:
-                cdr = self._cdr(connection, data)
-            except Exception as error:
-                raise self._named(error, connection, time_ns) from error
-            yield RawMessage(connection.topic, connection.msgtype, time_ns, bytes(cdr))
+            yield self._raw(connection, time_ns, data)
 
     def sources(self) -> list[Source]:
         """What a copy of each topic needs to know; of ROS 1 the types as ROS 2 writes them."""
@@ -206,6 +229,13 @@ class Log:
         self._store(connection)  # which refuses any other definition than ours
         return keyframe_fields_from_cdr(data)
 
+    def _raw(self, connection: Connection, time_ns: int, data: bytes) -> RawMessage:
+        try:
+            cdr = self._cdr(connection, data)
+        except Exception as error:
+            raise self._named(error, connection, time_ns) from error
+        return RawMessage(connection.topic, connection.msgtype, time_ns, bytes(cdr))
+
     def _cdr(self, connection: Connection, data: bytes) -> bytes:
         if isinstance(connection.ext, ConnectionExtRosbag1):
             return bytes(self._store(connection).ros1_to_cdr(data, connection.msgtype))
@@ -234,13 +264,14 @@ class Log:
         return ", ".join(told[:LISTED]) + more if told else "no topics at all"
 
 
-def _in_order(
-    time_ns: int, held: list[tuple[KeyframeFields, bytes]]
-) -> Iterator[tuple[int, Keyframe | None, Rejection | None]]:
-    if len(held) > 1:
-        held.sort(key=lambda one: (one[0].session, one[0].stamp_ns, one[0].id, bytes(one[1])))
-    for fields, _ in held:
-        yield time_ns, *keyframe_of(fields)
+def _in_order(held: list[_Held]) -> list[_Held]:
+    """Messages of one log time: the keyframes among them change places until they are by session, stamp, id and bytes."""
+    if len(held) < 2:
+        return held
+    keyframes = [(one.fields, bytes(one.data), one) for one in held if one.fields is not None]
+    keyframes.sort(key=lambda k: (k[0].session, k[0].stamp_ns, k[0].id, k[1]))
+    following = iter(keyframes)
+    return [one if one.fields is None else next(following)[2] for one in held]
 
 
 def _qos(connection: Connection) -> str:
