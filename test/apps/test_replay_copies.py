@@ -4,8 +4,10 @@ from pathlib import Path
 
 import pytest
 import worlds
+import yaml
 from log_samples import KINDS, write_mcap
 from mcap.reader import make_reader
+from message_samples import rclpy_types
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
@@ -63,6 +65,29 @@ def test_a_folder_tells_what_is_in_it(world, tmp_path) -> None:
         assert qos == {name: "TRANSIENT_LOCAL" if name == "state" else "VOLATILE" for name in TOPICS}
         span = reader.end_time - 1, reader.start_time
         assert span == (world[1].keyframes[11].stamp_ns, world[1].keyframes[0].stamp_ns)
+
+
+@pytest.mark.ros
+def test_what_ros2_bag_play_does_with_a_folder_rclpy_can_do(world, tmp_path) -> None:
+    """In place of rosbag2's own player, which has no wheel: each topic's type, QoS and bytes."""
+    serialization = pytest.importorskip("rclpy.serialization", reason="rclpy is not installed")
+    qos = pytest.importorskip("rclpy.qos")
+    out = tmp_path / "out"
+    assert replay(write_mcap(tmp_path / "run.mcap", world[1].keyframes[:12]), out, world, "--copy-inputs") == 0
+    told = yaml.safe_load((out / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    counts = {t["topic_metadata"]["name"]: t["message_count"] for t in told["topics_with_message_count"]}
+    assert told["relative_file_paths"] == [p.name for p in out.glob("*.mcap")]
+    for topic in (t["topic_metadata"] for t in told["topics_with_message_count"]):
+        (offered,) = yaml.safe_load(topic["offered_qos_profiles"])
+        policies = {name: offered[name] for name in ("history", "depth", "reliability", "durability", "liveliness")}
+        assert qos.QoSProfile(**policies).reliability is qos.ReliabilityPolicy.RELIABLE
+        assert topic["serialization_format"] == "cdr"
+        assert topic["type_description_hash"].startswith("RIHS01_") and rclpy_types(topic["type"])
+    with Log(out) as log:
+        for raw in log.raw_messages():
+            serialization.deserialize_message(raw.data, rclpy_types(raw.type))  # raises where it cannot
+            counts[raw.topic] -= 1
+    assert set(counts.values()) == {0}
 
 
 def test_latched_topics_stay_latched_and_own_topics_are_not_copied(world, tmp_path, capsys) -> None:
