@@ -59,7 +59,7 @@ setup(
         ],
         # Exact where another version gives other numbers or bytes.
         "algo": [
-            "numpy>=2,<3",
+            "numpy==2.4.6",  # the newest that Python 3.11 has, too
             "scipy>=1.14,<2",
             "gtsam==4.3.0",
             "poselib==2.0.5",

@@ -14,6 +14,7 @@ from xalign_ros.core.odometry import (
     pose_covariance,
     predict,
     step_size,
+    times_usual,
     with_leap,
 )
 from xalign_ros.core.records import Estimate, Features, Keyframe, RelativePose
@@ -34,6 +35,16 @@ def leaps(steps, scale=1.0):
         found.append(with_leap(edge(length), earlier[-10:], scale).sigmas[3] > 0.1)
         earlier.append(step_size(edge(length).T_i_j))
     return [n for n, leapt in enumerate(found) if leapt]
+
+
+def test_a_step_over_lost_keyframes_is_that_much_longer():
+    """Five steps of a metre and 0.3 rad; the next one is as long as the time since then makes it, or it is a leap."""
+    usual, times = [(1.0, 0.3)] * 5, times_usual(0.3, [0.1] * 5)
+    assert times == pytest.approx(3) and times_usual(9.0, [0.1] * 5) == 4 and times_usual(0.05, [0.1] * 5) == 1
+    assert times_usual(9.0, [0.1] * 2) == times_usual(9.0, [0.0] * 5) == 1
+    assert with_leap(edge(3.0, 1.0), usual, 1.0).sigmas[0] == pytest.approx(1)  # in one interval
+    assert with_leap(edge(3.0, 1.0), usual, 1.0, times).sigmas[0] == SIGMAS[0]
+    assert with_leap(edge(12.0), usual, 1.0, times).sigmas[3] == pytest.approx(12)
 
 
 def test_a_step_has_a_length_and_an_angle() -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from xalign_ros.core.config import Config
 from xalign_ros.core.consensus import Consensus, Witness, find_consensus, joins
 from xalign_ros.core.lie import Array
-from xalign_ros.core.odometry import edge_between, pose_covariance, predict, step_size, with_leap
+from xalign_ros.core.odometry import edge_between, pose_covariance, predict, step_size, times_usual, with_leap
 from xalign_ros.core.records import Anchor, Estimate, Keyframe, Rejection, RelativePose, State
 from xalign_ros.core.status import judge
 from xalign_ros.core.transforms import SE3, Sim3
@@ -61,6 +61,7 @@ class Belief:
         """Nothing that was learnt about the last session's frame holds for the next one's."""
         self._links: deque[_Link] = deque(maxlen=self.config.lock.memory)
         self._steps: deque[tuple[float, float]] = deque(maxlen=STEPS)
+        self._intervals: deque[float] = deque(maxlen=STEPS)  # s
         self._window: Window | None = None
         self._anchored: _Link | None = None  # the last keyframe whose anchor was accepted
         self._parties = 0
@@ -103,7 +104,9 @@ class Belief:
         if self._links:
             last = self._links[-1]
             measured = edge_between(last.keyframe, keyframe, self.scale, self.config.odometry)
-            edge = with_leap(measured, self._steps, self.scale)
+            seconds = (keyframe.stamp_ns - last.keyframe.stamp_ns) / 1e9
+            edge = with_leap(measured, self._steps, self.scale, times_usual(seconds, self._intervals))
+            self._intervals.append(seconds)
             self._steps.append(step_size(edge.T_i_j))
             leapt, path = edge is not measured, last.path + self._steps[-1][0]
         self._links.append(_Link(keyframe, path, edge, leapt))

@@ -15,6 +15,9 @@ from xalign_ros.core.transforms import SE3, Sim3
 
 LEAP_RATIO = 3.0  # of a step over the usual one, beyond which the odometry leapt rather than moved
 LEAP_M, LEAP_RAD = 0.5, 0.9  # and at least this far: robots turn in corners, but views that share nothing track nothing
+MOST_LOST = (
+    4.0  # times the usual interval that a step may be longer for; an odometry that pauses may well have lost itself
+)
 METRIC_WALK = 0.1  # part of metric_scale_sigma that a metric odometry's scale may wander per sqrt(m)
 
 
@@ -55,23 +58,34 @@ def step_size(T_i_j: SE3) -> tuple[float, float]:
     return math.hypot(*T_i_j.t.tolist()), math.acos(min(max((float(T_i_j.R.trace()) - 1) / 2, -1.0), 1.0))
 
 
-def leaps(step: tuple[float, float], earlier: Sequence[tuple[float, float]], scale: float) -> bool:
-    """Whether a `step_size` is out of all proportion to the `earlier` ones; of too few nothing can be said."""
-    length, angle = step
+def times_usual(seconds: float, earlier: Sequence[float]) -> float:
+    """A step's time over that of most `earlier` ones, where keyframes between may be lost: 1 to MOST_LOST; 1 of too few."""
+    if len(earlier) < 3:
+        return 1.0
+    usual = sorted(earlier)[len(earlier) // 2]
+    return min(max(seconds / usual, 1.0), MOST_LOST) if usual > 0 else 1.0
+
+
+def leaps(step: tuple[float, float], earlier: Sequence[tuple[float, float]], scale: float, times: float = 1.0) -> bool:
+    """Whether a `step_size`, of so many `times_usual`, is out of all proportion to the `earlier` ones; of too few nothing
+    can be said."""
+    length, angle = step[0] / times, step[1] / times
     if (length <= LEAP_M / scale and angle <= LEAP_RAD) or len(earlier) < 3:
         return False
     usual = np.sort(earlier, axis=0)[-2]
     return bool(length > max(LEAP_RATIO * usual[0], LEAP_M / scale) or angle > max(LEAP_RATIO * usual[1], LEAP_RAD))
 
 
-def with_leap(edge: RelativePose, earlier: Sequence[tuple[float, float]], scale: float) -> RelativePose:
+def with_leap(
+    edge: RelativePose, earlier: Sequence[tuple[float, float]], scale: float, times: float = 1.0
+) -> RelativePose:
     """The edge, or, where its step is out of all proportion to the `earlier` ones, one that says next to nothing.
 
     An odometry that lost its tracks leaps, by an amount that is no measurement: its sigmas are raised to that amount. What
     is usual is the second largest step, so that one leap does not hide the next, and a robot that drives off does.
     """
     length, angle = step_size(edge.T_i_j)
-    if not leaps((length, angle), earlier, scale):
+    if not leaps((length, angle), earlier, scale, times):
         return edge
     return RelativePose(edge.i, edge.j, edge.T_i_j, np.maximum(edge.sigmas, np.r_[[angle] * 3, [length] * 3, 0.0]))
 

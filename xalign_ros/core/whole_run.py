@@ -20,7 +20,7 @@ from xalign_ros.core.config import Config
 from xalign_ros.core.graph import Solution, solve
 from xalign_ros.core.intake import carries_pose, in_chain
 from xalign_ros.core.lie import Array
-from xalign_ros.core.odometry import edge_between, pose_covariance, step_size, with_leap
+from xalign_ros.core.odometry import edge_between, pose_covariance, step_size, times_usual, with_leap
 from xalign_ros.core.pose_graph import Loss
 from xalign_ros.core.records import Anchor, Keyframe, Rejection, RelativePose, Step
 from xalign_ros.core.reference_map import MapIndex, ReferenceMap
@@ -162,9 +162,12 @@ def _smoothed(links: list[_Link], index: MapIndex, config: Config) -> _Smoothed:
 
 
 def _solved(links: list[_Link], start: list[Sim3], config: Config) -> Solution:
-    edges, steps = list[RelativePose](), deque[tuple[float, float]](maxlen=STEPS)
+    edges, steps, intervals = list[RelativePose](), deque[tuple[float, float]](maxlen=STEPS), deque[float](maxlen=STEPS)
     for before, link, S in zip(links, links[1:], start, strict=False):
-        edge = with_leap(edge_between(before.keyframe, link.keyframe, S.s, config.odometry), steps, S.s)
+        seconds = (link.keyframe.stamp_ns - before.keyframe.stamp_ns) / 1e9
+        measured = edge_between(before.keyframe, link.keyframe, S.s, config.odometry)
+        edge = with_leap(measured, steps, S.s, times_usual(seconds, intervals))
+        intervals.append(seconds)
         steps.append(step_size(edge.T_i_j))
         edges.append(edge)
     anchors = [(link.keyframe.id, link.anchor) for link in links if link.anchor]
