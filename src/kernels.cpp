@@ -155,6 +155,7 @@ py::tuple expected(const Rows<double> &numbers, const Rows<double> &R, const Row
   expect_rows(rows, points.shape(0));
   std::vector<std::int64_t> seen;
   std::vector<double> centre, S;
+  seen.reserve(rows.size()), centre.reserve(2 * rows.size()), S.reserve(3 * rows.size());
   const double *C = cov_cam.data(), *b = box.data();
   for (py::ssize_t n = 0; n < rows.size(); ++n) {
     double x[3], uv[2], J[6], A[12], by[6];
@@ -202,16 +203,16 @@ py::tuple candidates(int norm, const Rows<double> &uv, const Table<T> &descripto
   expect_rows(rows, table.shape(0));
   xalign::Pairs found;
   if (uv.shape(0) == 0) return arrays_of(found);
-  constexpr double CELL = 32.0;  // px
+  constexpr double CELL = 16.0;  // px
   const xalign::Grid grid(uv.data(), uv.shape(0), CELL);
   std::vector<std::int64_t> inside;
   std::vector<double> distance;
   for (py::ssize_t n = 0; n < rows.size(); ++n) {
     double a = S.data()[3 * n], b = S.data()[3 * n + 1], c = S.data()[3 * n + 2];
-    const double largest = (a + c) / 2 + std::hypot((a - c) / 2, b);
+    const double apart = (a - c) / 2, largest = (a + c) / 2 + std::sqrt(apart * apart + b * b);
     const double factor = std::min(sigmas * sigmas, most_px * most_px / largest);
     a *= factor, b *= factor, c *= factor;
-    const double det = a * c - b * b, w[3] = {c / det, -2 * b / det, a / det}, half[2] = {std::sqrt(a), std::sqrt(c)};
+    const double scale = 1 / (a * c - b * b), w[3] = {c * scale, -2 * b * scale, a * scale}, half[2] = {std::sqrt(a), std::sqrt(c)};
     inside.clear();
     grid.inside(centre.data() + 2 * n, half, w, inside);
     distance.resize(inside.size());

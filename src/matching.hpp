@@ -14,7 +14,7 @@
 
 namespace xalign {
 
-// The same code for processors with and without these instructions; the numbers do not differ.
+// The same code for processors with and without these instructions; nothing is contracted, so the numbers do not differ.
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FOR_ANY_X86 __attribute__((target_clones("arch=haswell", "popcnt", "default")))
 #else
@@ -118,7 +118,7 @@ class Grid {
         low_[axis] = std::min(low_[axis], uv[2 * n + axis]);
         high_[axis] = std::max(high_[axis], uv[2 * n + axis]);
       }
-      cell_[axis] = std::max(cell, (high_[axis] - low_[axis]) / MOST);
+      per_px_[axis] = 1 / std::max(cell, (high_[axis] - low_[axis]) / MOST);
       cells_[axis] = cell_of(high_[axis], axis) + 1;
     }
     start_.assign(cells_[0] * cells_[1] + 1, 0);
@@ -155,10 +155,10 @@ class Grid {
   static constexpr int MOST = 128;  // cells along an axis
 
   int cell_of(double x, int axis) const {
-    return static_cast<int>((std::clamp(x, low_[axis], high_[axis]) - low_[axis]) / cell_[axis]);
+    return static_cast<int>((std::clamp(x, low_[axis], high_[axis]) - low_[axis]) * per_px_[axis]);
   }
 
-  double low_[2], high_[2], cell_[2];
+  double low_[2], high_[2], per_px_[2];
   int cells_[2];
   std::vector<int> start_;
   std::vector<std::int64_t> row_;

@@ -59,6 +59,8 @@ inline void turn(double R[9], const double w[3]) {
   }
 }
 
+inline double length(const double r[2]) { return std::sqrt(r[0] * r[0] + r[1] * r[1]); }  // hypot takes ten times as long
+
 struct Match {
   double uv[2], sigma_px, X[3], cov[9];
 };
@@ -76,7 +78,7 @@ inline void residual(const Camera &camera, const Pose &T, const Match &m, bool w
   const bool valid = camera.project(x[0], x[1], x[2], uv, J);
   for (int i = 0; i < 2; ++i) out.r[i] = valid ? uv[i] - m.uv[i] : 0.0;
   if (!valid) std::fill(J, J + 6, 0.0);
-  out.depth = x[2], out.error_px = std::hypot(out.r[0], out.r[1]);
+  out.depth = x[2], out.error_px = length(out.r);
   if (whiten) {
     double M[6], uu = m.sigma_px * m.sigma_px, uv_ = 0, vv = uu;
     by_point(J, T.R, M);
@@ -95,7 +97,7 @@ inline void residual(const Camera &camera, const Pose &T, const Match &m, bool w
   whitened(out.r[0], out.r[1]);
   for (int j = 0; j < 3; ++j) whitened(J[j], J[3 + j]);
   by_pose(J, x, out.A);
-  out.size = valid ? std::hypot(out.r[0], out.r[1]) : std::numeric_limits<double>::infinity();
+  out.size = valid ? length(out.r) : std::numeric_limits<double>::infinity();
 }
 
 struct Refinement {
@@ -158,7 +160,7 @@ inline Refinement refine_pose(const Camera &camera, Pose &T, const std::vector<M
     if (sweep && gain < CONVERGED * CONVERGED * out.scale * out.scale) {
       for (Residual &r : residuals) {  // so small a step is linear
         for (int i = 0; i < 6; ++i) r.r[0] += step[i] * r.A[i], r.r[1] += step[i] * r.A[6 + i];
-        r.size = std::hypot(r.r[0], r.r[1]);
+        r.size = length(r.r);
       }
       break;
     }
