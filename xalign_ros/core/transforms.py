@@ -30,10 +30,24 @@ def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: DT
 def _rigid(R: Array, t: Array) -> SE3:
     """Of arrays just made here out of checked ones, in a fifth of the time: a step makes dozens of poses."""
     T: SE3 = object.__new__(SE3)
-    for name, value in (("R", R), ("t", t)):
-        value.setflags(write=False)
-        object.__setattr__(T, name, value)
+    R.setflags(write=False)
+    t.setflags(write=False)
+    object.__setattr__(T, "R", R)
+    object.__setattr__(T, "t", t)
     return T
+
+
+def _similar(R: Array, t: Array, s: float) -> Sim3:
+    """The same of a similarity."""
+    if s <= 0:
+        raise ValueError(f"Sim3.s is {s}, a scale is positive")
+    S: Sim3 = object.__new__(Sim3)
+    R.setflags(write=False)
+    t.setflags(write=False)
+    object.__setattr__(S, "R", R)
+    object.__setattr__(S, "t", t)
+    object.__setattr__(S, "s", s)
+    return S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +104,7 @@ class SE3:
         return _rigid(self.R @ other.R, self.R @ other.t + self.t)
 
     def as_sim3(self) -> Sim3:
-        return Sim3(self.R, self.t, 1.0)
+        return _similar(self.R, self.t, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,7 +138,7 @@ class Sim3:
         return lie.sim3_adjoint(self.R, self.t, self.s)
 
     def inverse(self) -> Sim3:
-        return Sim3(self.R.T, -(self.R.T @ self.t) / self.s, 1 / self.s)
+        return _similar(self.R.T.copy(), -(self.R.T @ self.t) / self.s, 1 / self.s)
 
     def apply(self, x: ArrayLike) -> Array:
         """Points (..., 3) of b, in a."""
@@ -136,7 +150,7 @@ class Sim3:
     def __matmul__(self, other: Sim3) -> Sim3: ...
     def __matmul__(self, other: SE3 | Sim3) -> Sim3:
         scale = other.s if isinstance(other, Sim3) else 1.0
-        return Sim3(self.R @ other.R, self.s * (self.R @ other.t) + self.t, self.s * scale)
+        return _similar(self.R @ other.R, self.s * (self.R @ other.t) + self.t, self.s * scale)
 
     def rigid_pose(self) -> SE3:
         """T_a_b with b's axes and origin, b measured in a's unit from here on: the one way from S_ back to T_."""
