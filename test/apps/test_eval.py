@@ -74,7 +74,7 @@ def test_figures_are_those_of_evo(tmp_path: Path, capsys) -> None:
         assert ours["from_pose_to_pose"][key] == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=1e-6)
 
 
-@pytest.mark.parametrize(("seed", "worse"), [("0", False), ("4", True)])
+@pytest.mark.parametrize(("seed", "worse"), [("1", False), ("0", True)])
 def test_a_run_and_its_output_log_have_the_errors_that_replay_says(seed, worse, tmp_path: Path, capsys) -> None:
     sim = tmp_path / "sim"
     assert main(["simulate", "-o", str(sim), "--world", "hall", "--keyframes", "30", "--seed", seed]) == 0

@@ -27,7 +27,7 @@ def test_exact_ties_bring_disturbed_bodies_home_but_for_scale() -> None:
     truth, ties = world()
     start = disturbed(truth)
     after, solution = solved(start, graph_of(start, edges_of(ties, start), [0], Loss()))
-    assert solution.converged and off(after[0], truth[0]) == (0, 0)
+    assert solution.converged and max(off(after[0], truth[0])) < 1e-15  # it is fixed
     for was, now, true in zip(start[1:], after[1:], truth[1:], strict=True):
         assert off(now, true)[0] < 2e-3 < off(was, true)[0]
         a, b = ((v.T_site_body @ T_BODY_CAM).t - truth[0].camera.C for v in (now, true))

@@ -32,7 +32,8 @@ from xalign_ros.core.extraction import orb
 from xalign_ros.core.records import Features
 from xalign_ros.core.transforms import SE3
 from xalign_ros.io import ros_fields as ros
-from xalign_ros.io.adapter import IMAGES, KINDS, PLAIN, Adapter, SourceOptions, keyframe_from_frame
+from xalign_ros.io.adapter import IMAGES, KINDS, PLAIN, Adapter, SourceOptions
+from xalign_ros.io.frame import keyframe_from_frame
 from xalign_ros.io.frame_messages import TF
 from xalign_ros.io.image_message import COMPRESSED, IMAGE
 from xalign_ros.io.log import typestore

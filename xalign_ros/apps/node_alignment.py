@@ -19,8 +19,8 @@ from xalign_ros.core.odometry import step_size
 from xalign_ros.core.records import INPUT_REASONS, AlignmentState, Anchor, Correction, Estimate, Keyframe, State, Step
 from xalign_ros.core.reference_map import ReferenceMap
 from xalign_ros.core.transforms import SE3, Sim3
-from xalign_ros.io.adapter import Frame, keyframe_from_frame
 from xalign_ros.io.adapter_log import extractor_for
+from xalign_ros.io.frame import Frame, keyframe_from_frame
 from xalign_ros.io.keyframe_cdr import keyframe_fields_from_cdr
 from xalign_ros.io.keyframe_fields import NO_FEATURES, keyframe_of
 from xalign_ros.io.ros_fields import covariance_from_ros, ros_types

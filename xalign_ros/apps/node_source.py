@@ -10,7 +10,8 @@ from rclpy.qos import QoSProfile
 
 from xalign_ros.apps.node_endpoints import LOSSY, QUEUE
 from xalign_ros.core.config import Selection
-from xalign_ros.io.adapter import IMAGES, KINDS, Adapter, Frame, Role, SourceOptions
+from xalign_ros.io.adapter import IMAGES, KINDS, Adapter, Role, SourceOptions
+from xalign_ros.io.frame import Frame
 
 IMAGE_BYTES, POINTS_BYTES, SMALL_BYTES = 32 << 20, 4 << 20, 64 << 10  # of one message at most
 MOST_BYTES = {"image": IMAGE_BYTES, "compressed": IMAGE_BYTES, "points": POINTS_BYTES}

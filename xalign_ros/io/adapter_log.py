@@ -24,9 +24,9 @@ from xalign_ros.io.adapter import (
     PLAIN,
     Adapter,
     SourceOptions,
-    keyframe_from_frame,
 )
 from xalign_ros.io.camera_file import read_camera
+from xalign_ros.io.frame import keyframe_from_frame
 from xalign_ros.io.frame_messages import TF
 from xalign_ros.io.image_message import COMPRESSED, IMAGE
 from xalign_ros.io.images import extractor
